@@ -205,13 +205,15 @@ def touch(rig, start, speed, controller, ticks, disturb=lambda tick, force, posi
     return np.array(rows).transpose(1, 0, 2)
 
 
-def restitution(rig, speed, law):
+def restitution(rig, speed, law, phase=1 / 3):
     """Return the restitution of the rig's first contact under a compensator's `step`, without noise.
+
+    `phase` states at which point of a control period the contact begins (0 to 1).
 
     As stated in the guide, the contact ends when no real force has acted for longer than the sensor's memory,
     and the command has fallen below 1e-6 of its peak (at most 0.1 s later).
     """
-    start = min(rig.plane, 0.0) - speed * (0.02 + rig.period / 3)
+    start = min(rig.plane, 0.0) - speed * (0.02 + phase * rig.period)
 
     def controller(force, position, velocity, measured):
         values = (float(v[0]) for v in (force, position, velocity, measured))

@@ -73,6 +73,19 @@ def test_verdict_names_the_model_that_explains_logs_best(clean):
     assert worst(replace(result, lines=(hold, replace(low_pass, gain=2.0)))) == hold.name
 
 
+@pytest.mark.parametrize("delay", (0.0043, 0.0063))
+def test_mechanism_check_compares_motion_in_contact_without_runs_of_free_motion(clean, delay):
+    """Without free motion, a wrong delay of the simulator shows only in the positions during contacts."""
+    touches = replace(clean, runs=tuple(run for run in clean.runs if run.kind != "free"))
+    mechanism = campaign_rigs.mechanism("clean", simulator__delay=delay)
+    result = check_against_mechanism(touches, mechanism)
+    (line,) = (line for line in result.lines if line.name == "motion in contact")
+    late = 1e-3 * float(line.finding.split()[0]) * (1 if "earlier" in line.finding else -1)
+    assert late == pytest.approx(delay - 0.0043, abs=1e-4)
+    assert (line.is_significant, result.good) == ((True, False) if delay > 0.0043 else (False, True))
+    assert delay == 0.0043 or result.effect > 0.01
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", [name for name in campaigns.KINDS if name != "drifting"])
 def test_mechanism_check_accepts_logs_of_every_kind_of_rig(name):

@@ -3,6 +3,7 @@
 from dataclasses import replace
 from types import SimpleNamespace
 
+import campaign_kinds
 import campaigns
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from tuning.identification.contact_problem import MAX_FORCE_DELAY, ContactProble
 from tuning.identification.contact_profile import compute_posterior
 from tuning.identification.contact_runs import exclude_rows_after_gaps, split_long_run
 from tuning.identification.force_readings import ForceReadings
+from tuning.identification.identify import IdentificationOptions, identify
 from tuning.identification.law_choice import choose_contact_law, search_coarsely
 from tuning.identification.motion import MotionResponse, compute_matrix_exponential
 from tuning.identification.rational import STRUCTURES, MotionModel
@@ -205,3 +207,28 @@ def test_quick_delay_search_stays_within_longest_delay():
     late = ContactProblem(clean.motion, late, clean.law, clean.plane)
     delay, *_ = search_coarsely(late, (MAX_FORCE_DELAY + 0.002, 0.0, np.inf))
     assert delay <= MAX_FORCE_DELAY
+
+
+@pytest.mark.parametrize(("lag", "seed"), [(0.0, 0), (0.0, 1), (0.0018, 3)])
+def test_identify_finds_best_of_many_local_optima_of_stiff_damped_contact(monkeypatch, lag, seed):
+    """A jump of the force by up to 30 times the noise makes the misfit a staircase."""
+    simulator = {
+        "model": "second_order",
+        "natural_frequency": 40.0,
+        "damping_ratio": 0.7,
+        "delay": 0.0009,
+    }
+    rig = campaign_kinds.rig(noise=3.3, simulator=simulator, force_sensor__time_constant=lag)
+    contact = campaign_kinds.voigt((1.2e6,), (4760.0,))
+    kind = campaign_kinds.Kind(rig, contact, colour=0.85, mass=1140.0)
+    monkeypatch.setitem(campaigns.KINDS, "stiff", kind)
+    campaign = campaigns.campaign("stiff", seed, seconds=10.0)
+    result = identify(campaign, options=IdentificationOptions(law="kelvin_voigt", hold_out=0.0))
+    age = result["delay and lag of force" if lag else "rig.force_sensor.delay"]
+    for estimate, true in (
+        (age, 0.0037 + lag),
+        (result["contact.damping.0"], 4760.0),
+        (result["contact.stiffness.0"], 1.2e6),
+        (result["rig.contact_plane"], 0.0),
+    ):
+        assert abs(estimate.value - true) < 3.5 * estimate.std

@@ -1,5 +1,9 @@
 """Identification of rigs whose force sensor has a random walk of its bias."""
 
+from dataclasses import replace
+
+import campaign_kinds
+import campaigns
 import numpy as np
 import pytest
 from independent_study import evaluate_identification
@@ -11,6 +15,7 @@ from tuning.identification.drifting_noise import (
     estimate_force_noise,
     subtract_weighted_mean,
 )
+from tuning.identification.identify import IdentificationOptions, identify
 
 PERIOD, NOISE, WALK, BIAS = 1e-3, 0.3, 0.7, 0.2
 
@@ -45,6 +50,22 @@ def test_filter_of_drifting_noise_whitens_readings_and_removes_bias():
     assert white.std() == pytest.approx(noise.innovation, rel=0.02)
     for lag in (1, 10, 50):
         assert abs(np.mean(white[lag:] * white[:-lag])) < 5 * white.var() / len(white) ** 0.5
+
+
+def test_filter_of_drifting_noise_skips_lost_readings():
+    readings, random = rest(3, number=40_000), np.random.default_rng(0)
+    noise = estimate_drifting_noise(readings, PERIOD, WALK)
+    lost = random.random(len(readings)) < 0.03
+    white = subtract_weighted_mean(np.where(lost, 1e6, readings), noise.filter, lost)
+    assert np.all(white[lost] == 0.0)
+    white = white[~lost][len(noise.filter) :]
+    assert white.std() == pytest.approx(noise.innovation, rel=0.02)
+    for lag in (1, 10, 50):
+        assert abs(np.mean(white[lag:] * white[:-lag])) < 5 * white.var() / len(white) ** 0.5
+    lanes = np.stack([lost, np.zeros_like(lost)])
+    both = subtract_weighted_mean(np.stack([readings, readings]), noise.filter, lanes)
+    np.testing.assert_array_equal(both[0], subtract_weighted_mean(readings, noise.filter, lost))
+    np.testing.assert_array_equal(both[1], subtract_weighted_mean(readings, noise.filter))
 
 
 def test_readings_without_noise_have_no_random_walk():
@@ -84,3 +105,22 @@ def test_identify_verdict_is_good_for_campaign_with_random_walk(kind, seed, tmp_
     outcome = evaluate_identification(kind, seed, tmp_path)
     assert (outcome.verdict, outcome.check, outcome.wrong, outcome.trouble) == ("good", "good", False, "")
     assert "random walk of 0." in outcome.message
+
+
+def test_identify_uses_contacts_with_random_walk_and_lost_rows(monkeypatch):
+    """Its filter combines 200 readings; one of 30 is lost."""
+    kind = campaign_kinds.Kind(campaign_kinds.rig(), campaign_kinds.voigt(), lost=0.03)
+    monkeypatch.setitem(campaigns.KINDS, "lossy", kind)
+    campaign = campaigns.campaign("lossy", 0, seconds=10.0)
+    rng, runs = np.random.default_rng(0), []
+    for run in campaign.runs:
+        if run.force_measured is not None:
+            walk = WALK * PERIOD**0.5 * np.cumsum(rng.normal(size=len(run.tick)))
+            run = replace(run, force_measured=run.force_measured + walk)
+        runs.append(run)
+    campaign = replace(campaign, runs=tuple(runs))
+    result = identify(campaign, options=IdentificationOptions(law="kelvin_voigt", hold_out=0.0))
+    assert any("random walk" in note for note in result.notes)
+    assert result.contact.degrees_of_freedom > 0.3 * sum(run.valid.sum() for run in runs[2:])
+    for key, true in (("contact.damping.0", 650.0), ("rig.force_sensor.delay", 0.0037)):
+        assert abs(result[key].value - true) < 3.5 * result[key].std

@@ -179,6 +179,42 @@ def test_motion_model_fit_is_unbiased_if_log_rows_are_lost():
     assert result.noise_std == pytest.approx(5e-6, rel=0.02)
 
 
+def test_local_polynomial_spectrum_omits_only_rows_after_long_gaps():
+    kind, T = campaigns.KINDS["clean"], 0.001
+    time = np.arange(20_000) * T
+    command = 1e-3 * np.sin(2.0 * np.pi * (0.3 * time + (20.0 - 0.3) * time**2 / (2.0 * time[-1])))
+    rng = np.random.default_rng(0)
+    output = campaigns._position(campaigns.Plant(kind.rig), command, 4.3)
+    output += 1e-6 * rng.standard_normal(len(output))
+    complete = frf.compute_spectrum(command, output, np.ones(len(command), bool), T, 500)
+    valid = rng.random(len(command)) > 0.03
+    spectrum = frf.compute_spectrum(command, np.where(valid, output, np.nan), valid, T, 500)
+    np.testing.assert_array_equal(spectrum.frequency, complete.frequency)
+    assert np.sqrt(np.mean(np.abs((spectrum.output - complete.output) / complete.std) ** 2)) < 0.5
+    assert np.median(spectrum.std / complete.std) == pytest.approx(1.0, abs=0.1)
+    valid[6000:6010] = False
+    longest = frf.compute_spectrum(command, np.where(valid, output, np.nan), valid, T, 500)
+    rows = slice(6010 + 500, None)
+    part = frf.compute_spectrum(command[rows], output[rows], valid[rows], T, 500)
+    assert abs(len(longest.frequency) - len(part.frequency)) <= 1
+
+
+@pytest.mark.parametrize(("noise", "limit"), ((0.0, 2.0), (1e-6, 1.2)))
+def test_spectrum_of_two_periods_interpolates_rows_that_both_lost(noise, limit):
+    kind, T = campaigns.KINDS["clean"], 0.001
+    command = np.tile(campaigns.multisine(T), 4) - 0.03
+    output = campaigns._position(campaigns.Plant(kind.rig), command, 4.3)
+    rng = np.random.default_rng(0)
+    output = np.round(output + noise * rng.standard_normal(len(output)), 7)[5000:]
+    valid = rng.random(len(output)) > 0.05
+    assert np.any(~valid.reshape(3, -1)[1:].any(axis=0))
+    spectrum = frf.compute_spectrum(command[5000:], np.where(valid, output, np.nan), valid, T, 500)
+    assert spectrum.periods == 2
+    lines = SpectralLines(spectrum.frequency, spectrum.command, spectrum.output, spectrum.std, T, "linear", 0)
+    score = (SECOND.predict(lines) - spectrum.output) / spectrum.std
+    assert np.sqrt(np.mean(np.abs(score) ** 2)) < limit
+
+
 def test_spectrum_detects_nonlinearity_at_unexcited_frequencies():
     campaign = campaigns.campaign("clean", 3, speeds=(), rest=0)
     (run,) = campaign.runs

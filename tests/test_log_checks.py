@@ -1,5 +1,7 @@
 """Wrong descriptions of log channels, detected by the motion of the numerical model."""
 
+from unittest.mock import patch
+
 import numpy as np
 import pytest
 from log_cases import LAG, MASS, PERIOD, STIFFNESS, read, sway, touches, write_csv
@@ -105,6 +107,16 @@ def test_wrong_log_channels_of_a_run_without_contact_are_detected(tmp_path):
     (note,) = read(write_csv(tmp_path / "c.csv", noise), "free").notes
     assert "hardly follows position_desired" in note
     assert read(write_csv(tmp_path / "d.csv", sway(amplitude=0.0)), "rest").runs[0].kind == "rest"
+
+
+@pytest.mark.parametrize("delay", [5, 12])
+def test_short_motion_with_a_single_frequency_is_not_taken_for_a_reversed_one(tmp_path, delay):
+    """With a delay of 12 ms, the correlation is largest, and negative, 4 ms before the motion."""
+    times = PERIOD * np.arange(-delay, 170)
+    x = 1e-5 * np.sin(2 * np.pi * 30 * times + 2.2) * np.linspace(1.5, 0.1, len(times))
+    log = {"t": times[delay:] - times[0], "xd": x[delay:], "xm": x[:-delay]}
+    with patch.object(checks, "MIN_LOG_ROWS", 100):
+        assert read(write_csv(tmp_path / "a.csv", log), "free").runs
 
 
 def test_log_readings_that_repeat_for_several_rows_are_reported(tmp_path):

@@ -86,6 +86,7 @@ def estimate_clock_drift(
     time = time - time.mean()
     delays = _estimate_run_delays(MotionResponse(model, runs, timing, longest), readings, time, is_contact)
     rate = std = 0.0
+    variance = np.full(len(runs), np.inf)
     for _ in range(DRIFT_ITERATIONS):
         motion = MotionResponse(model, runs, timing, longest, delays)
         if not isinstance(law, Law):
@@ -99,7 +100,8 @@ def estimate_clock_drift(
         delays = delays + step * time
         if abs(step) * np.ptp(time) < DRIFT_TOLERANCE:
             break
-    if not std * np.ptp(time) < MAX_FORCE_DELAY:
+    informative = np.count_nonzero(variance[is_contact] < MAX_FORCE_DELAY**2)
+    if informative < MIN_CONTACTS_FOR_DRIFT or not std * np.ptp(time) < MAX_FORCE_DELAY:
         expected = "runs that contain the force of their contact"
         raise InputError(
             f'timing.clock: found "separate" and forces that do not follow the motion, expected {expected}'

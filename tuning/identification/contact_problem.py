@@ -75,7 +75,7 @@ class ContactProblem:
         # deviation.
         self.bias_alone = 0.0 if self.has_dead_zone else float(np.sum(readings.whitening)) / readings.std
         self.sums = sum_and_squares(self.target)
-        self.memory = len(readings.whitening) + int(
+        self.memory = _compute_filter_length(readings) + int(
             np.ceil(FILTER_MEMORY_TIME_CONSTANTS * time_constant / motion.period / readings.modes.slowest)
         )
         # Times at which the force is computed, in periods before a row. A lag integrates the force between
@@ -97,7 +97,8 @@ class ContactProblem:
 
     def whiten(self, values: np.ndarray) -> np.ndarray:
         """Apply the whitening filter along the rows of an array (..., rows, lanes)."""
-        return _whiten(values.swapaxes(-1, -2), self.readings.whitening).swapaxes(-1, -2)
+        lost = self.readings.lost.T
+        return _whiten(values.swapaxes(-1, -2), self.readings.whitening, lost).swapaxes(-1, -2)
 
     def changed(self, law: Law, time_constant: float, delay: float | None = None) -> ContactProblem:
         """Return a copy of the problem with this contact law and this time constant of the sensor [s].
@@ -246,19 +247,21 @@ class ContactProblem:
         columns = self._tabulate(np.zeros((1, len(row))), near.rate[row], near.rows[row])[0]
         return Onsets(plane, row, columns, left)
 
-    def _filter(self, tables: list[np.ndarray], onsets: Onsets | None, first, whitening) -> np.ndarray:
+    def _filter(self, rows, tables: list[np.ndarray], onsets: Onsets | None, first, whitening) -> np.ndarray:
         """Apply the sensor's filter and the whitening filter to the regressors in the rows near contact.
 
         Args:
+            rows: The rows near contact, shape (rows,); -1 after the end of a lane.
             tables: Regressors in the rows near contact (0 out of contact): one array (surface positions,
                 regressors, rows) per time in `self.periods_before` [periods before a row].
             onsets: Onsets of contact, or None if the sensor has no lag.
             first: Regressors just after the onsets, shape (regressors, onsets), or None.
             whitening: Coefficients of the whitening filter.
         """
+        lost = (rows >= 0) & self.readings.lost.ravel()[rows]
         if onsets is None or not tables[0].size:
-            return _whiten(tables[0], whitening)
-        return apply_filter(self.readings.modes, self.filter_rate, tables, whitening, onsets, first)
+            return _whiten(tables[0], whitening, lost)
+        return apply_filter(self.readings.modes, self.filter_rate, tables, whitening, onsets, first, lost)
 
     def inside(self, delay: float, planes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the design matrix and the readings of a problem whose lanes are always in contact.
@@ -273,11 +276,12 @@ class ContactProblem:
             for position, rate in self.motion_at(delay)
         ]
         tables = [table.reshape(*table.shape[:2], lanes, length) for table in tables]
+        whitening, lost = self.readings.whitening, self.readings.lost.T
         if self.time_constant:
-            drive = apply_filter(self.readings.modes, self.filter_rate, tables, self.readings.whitening)
+            drive = apply_filter(self.readings.modes, self.filter_rate, tables, whitening, lost=lost)
             drive /= self.readings.std
         else:
-            drive = _whiten(tables[0] / self.readings.std, self.readings.whitening)
+            drive = _whiten(tables[0] / self.readings.std, whitening, lost)
         used = self.is_used[rows]
         design = np.empty((len(planes), drive.shape[1] + 1, len(self.used_rows)))
         np.compress(used, drive.reshape(*drive.shape[:2], -1), axis=2, out=design[:, :-1])
@@ -308,7 +312,7 @@ class ContactProblem:
             first = np.vstack([onsets.columns, np.ones((int(self.has_dead_zone), len(onsets.row)))])
             first *= flags[0][onsets.plane, onsets.row] / std
         used = self.is_used[rows]
-        design = np.compress(used, self._filter(tables, onsets, first, self.readings.whitening), axis=2)
+        design = np.compress(used, self._filter(rows, tables, onsets, first, self.readings.whitening), axis=2)
         if not self.has_dead_zone:
             bias = np.full((len(design), 1, design.shape[2]), self.bias_alone)
             design = np.concatenate([design, bias], axis=1)
@@ -349,7 +353,7 @@ class ContactProblem:
         table = ((down - up) * flag / scale)[:, None]
         if self.is_unfiltered:
             return table[0, 0]
-        table = self._filter([table], None, None, self.readings.whitening)
+        table = self._filter(now.rows, [table], None, None, self.readings.whitening)
         return table[0, 0, self.is_used[now.rows]]
 
     def force(self, delay: float, plane: float, coefficients: np.ndarray) -> np.ndarray:
@@ -364,6 +368,21 @@ class ContactProblem:
         force = force.reshape(self.readings.force.shape)
         return force if self.has_dead_zone else force + coefficients[-1]
 
+    def compute_edge_residuals(self, delay: float, plane: float, coefficients: np.ndarray) -> np.ndarray:
+        """Return the residuals of the readings just before and after onsets, without sensor lag.
+
+        They are divided by the standard deviation of the noise. They are large if a row that is in contact
+        counts as out of contact, or the reverse.
+        """
+        ((position, rate),) = self.motion_at(delay)
+        lanes = self.readings.force.shape[1]
+        after = lanes + np.flatnonzero((position[lanes:] > plane) & (position[:-lanes] <= plane))
+        columns = self._tabulate(position[after][None] - plane, rate[after], after)
+        residuals = self.whitened - self.bias_alone * coefficients[-1]
+        after_residuals = residuals[after] - compute_force(coefficients[None], columns)[0] / self.readings.std
+        used = self.is_used[after] & self.is_used[after - lanes]
+        return np.concatenate([residuals[after - lanes][used], after_residuals[used]])
+
     def _predict(self, near, flags, onsets, coefficients, whitening) -> np.ndarray:
         """Predict whitened readings [N], (surface positions, rows), without a bias that all rows share."""
         offset, first = self.has_dead_zone * coefficients[-1], None
@@ -373,7 +392,7 @@ class ContactProblem:
         ]
         if onsets is not None:
             first = (coefficients[:-1] @ onsets.columns + offset) * flags[0][onsets.plane, onsets.row]
-        return self._filter(tables, onsets, first, whitening)[:, 0]
+        return self._filter(near[0].rows, tables, onsets, first, whitening)[:, 0]
 
     def touching(self, delay: float, plane: float, coefficients: np.ndarray) -> np.ndarray:
         """Return flags of the rows that are in contact according to the model, shape (rows, lanes)."""
@@ -386,9 +405,18 @@ class ContactProblem:
         return flags.reshape(self.readings.force.shape)
 
 
-def _whiten(values: np.ndarray, whitening: Sequence[float]) -> np.ndarray:
+def _compute_filter_length(readings: ForceReadings) -> int:
+    """Return the largest number of rows that the whitening filter combines, including lost ones it skips."""
+    length = len(readings.whitening)
+    if length <= LONG_FILTER:
+        return length
+    kept = [np.flatnonzero(valid) for valid in readings.is_valid.T]
+    return max(int(np.max(rows[length:] - rows[:-length], initial=length)) for rows in kept)
+
+
+def _whiten(values: np.ndarray, whitening: Sequence[float], lost: np.ndarray) -> np.ndarray:
     if len(whitening) > LONG_FILTER:
-        return subtract_weighted_mean(values, whitening)
+        return subtract_weighted_mean(values, whitening, lost)
     filtered = values.copy() if len(whitening) > 1 else values
     for lag, weight in enumerate(whitening[1:], 1):
         filtered[..., lag:] += weight * values[..., :-lag]

@@ -20,7 +20,7 @@ from tuning.identification import press_bias
 from tuning.identification.contact_problem import COARSE_DELAY_STEP, MAX_FORCE_DELAY, ContactProblem
 from tuning.identification.contact_regression import CoefficientFit
 from tuning.identification.normal_draws import factorise_covariance
-from tuning.identification.surface_search import find_best_surface
+from tuning.identification.surface_search import find_best_surface, has_steps
 
 FINE_DELAY_STEP = 2e-5  # step between the delays of the second grid [s]
 SMOOTHING_DELAYS = 7  # number of adjacent delays of the second grid whose surface positions are averaged
@@ -137,9 +137,14 @@ def _scan_delays(
     problem: ContactProblem, delays: np.ndarray, start: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Find, from `start`, the best surface position at each delay; return it, its std and log posterior."""
+    found = [find_best_surface(problem, delay, start, -np.inf) for delay in delays]
+    misfits = [inner.misfit - 2.0 * gain for _, inner, gain in found]
+    best = min(misfits)
+    for i in np.argsort(misfits) if has_steps(problem) else ():
+        found[i] = find_best_surface(problem, float(delays[i]), found[i][0], best + COARSE_GRID_DROP)
+        best = min(best, found[i][1].misfit - 2.0 * found[i][2])
     planes, stds, heights = [], [], []
-    for delay in delays:
-        plane, inner, gain = find_best_surface(problem, delay, start)
+    for plane, inner, gain in found:
         stds.append(1.0 if problem.plane is not None else 1.0 / np.sqrt(max(inner.curvature, 1e-300)))
         planes.append(plane)
         heights.append(inner.evidence + gain + np.log(stds[-1]))

@@ -71,8 +71,24 @@ def estimate_drifting_noise(readings: np.ndarray, period: float, stated: float) 
     return _fit_random_walk(readings, period, stated)[0]
 
 
-def subtract_weighted_mean(values: np.ndarray, whitening: Sequence[float]) -> np.ndarray:
-    """Apply a whitening filter of this module along the last axis, as fast as a filter of first order."""
+def subtract_weighted_mean(
+    values: np.ndarray, whitening: Sequence[float], lost: np.ndarray | None = None
+) -> np.ndarray:
+    """Apply a whitening filter of this module along the last axis, as fast as a filter of first order.
+
+    Args:
+        values: Values, shape (..., rows) or (..., lanes, rows).
+        whitening: Coefficients of the filter.
+        lost: Flags of the lost readings, shape (rows,) or (lanes, rows), or None. The filter skips them, and
+            their result is 0. The mean then covers a slightly longer time, in which the bias hardly drifts.
+    """
+    if lost is not None and lost.any():
+        result = np.zeros_like(values)
+        for lane, flags in enumerate(np.atleast_2d(lost)):
+            part = values if lost.ndim == 1 else values[..., lane, :]
+            filtered = subtract_weighted_mean(part[..., ~flags], whitening)
+            (result if lost.ndim == 1 else result[..., lane, :])[..., ~flags] = filtered
+        return result
     length, gain, pole = len(whitening), -whitening[1], whitening[2] / whitening[1]
     total: Any = lfilter([gain], [1.0, -pole], values)
     result = values.copy()

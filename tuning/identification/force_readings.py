@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ from scipy.signal import lfilter
 
 from jaxhil.mechanism.sensor_filter import FilterModes, find_modes
 from jaxhil.mechanism.structs import SensorFilter
+from tuning.identification.drifting_noise import LONG_FILTER
 from tuning.identification.records import LoggedRun
 
 
@@ -60,13 +62,22 @@ class ForceReadings:
         counts = is_valid = padded(valid, False, bool)
         force = padded([np.nan_to_num(force_column) for force_column in forces], 0.0, float)
         entry = padded([_assign_contact_entries(run) for run in runs], 0, int)
-        if len(whitening) > 1:
+        if len(whitening) > LONG_FILTER:
+            # The filter skips lost readings.
+            counts = counts & (np.cumsum(counts, axis=0) >= len(whitening))
+        elif len(whitening) > 1:
             # A reading is used only if all readings that the filter combines with it are valid.
             gap: Any = lfilter(np.ones(len(whitening)), [1.0], ~counts, axis=0)
             counts = counts & (gap < 0.5)
             counts[: len(whitening) - 1] = False
         entries = tuple(int(number) for number in np.unique(entry[counts])) or (0,)
         return cls(force, counts, entry, entries, std, tuple(whitening), threshold, is_valid=is_valid)
+
+    @cached_property
+    def lost(self) -> np.ndarray:
+        """Return flags of the missing readings that others follow, shape (rows, lanes)."""
+        followed = np.maximum.accumulate(self.is_valid[::-1], axis=0)[::-1]
+        return followed & ~self.is_valid
 
     @property
     def modes(self) -> FilterModes:

@@ -5,7 +5,12 @@ noise. Power at frequency lines without excitation indicates nonlinear distortio
 odd lines, asymmetry at even lines (Pintelon and Schoukens, System Identification: A Frequency Domain
 Approach, 2012). For any other command, the local polynomial method separates the response from the transient
 and the noise. It approximates response and transient by polynomials of degree 2 in a window of 13 frequency
-lines (Schoukens et al. 2009). Lost rows are omitted.
+lines (Schoukens et al. 2009).
+
+The rig itself does not notice that its log lost a row. The command of a short gap is reconstructed
+(`tuning.identification.logs.lost_rows`), so only the reading is missing. Averages over periods omit it. Where
+every row is needed, a cubic spline interpolates it, because the motion has little power near the highest
+frequencies. After a longer gap, the rows that the unknown commands affect are omitted.
 """
 
 from __future__ import annotations
@@ -14,6 +19,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
+from scipy.interpolate import CubicSpline
+
+from tuning.identification.logs.lost_rows import MAX_RECONSTRUCTED_ROWS
+from tuning.identification.noise import detect_resolution
 
 MIN_PERIOD_ROWS = 100  # rows, shortest period that the search for a periodic command considers
 VARIANCE_SMOOTHING_LINES = 15  # number of adjacent lines whose noise variance is averaged
@@ -111,11 +120,29 @@ def compute_spectrum(
             return average_periods(
                 command[rows].reshape(shape), output[rows].reshape(shape), valid[rows].reshape(shape), period
             )
-    undisturbed = valid & ~_flag_rows_after_gaps(valid, rest)
-    first, length = _find_longest_run(undisturbed)
+    known = valid | _flag_short_gaps(valid)
+    first, length = _find_longest_run(known & ~_flag_rows_after_gaps(known, rest))
     if length < 50 * SIDE_LINES:
         return None
-    return fit_local_polynomials(command[first : first + length], output[first : first + length], period)
+    rows = slice(first, first + length)
+    return fit_local_polynomials(command[rows], _interpolate(output[rows], valid[rows]), period)
+
+
+def _flag_short_gaps(valid: np.ndarray) -> np.ndarray:
+    """Flag the lost rows between valid rows in gaps that are short enough to reconstruct the command."""
+    rows, last = np.arange(len(valid)), len(valid)
+    before = np.maximum.accumulate(np.where(valid, rows, -last))
+    after = np.minimum.accumulate(np.where(valid, rows, 2 * last)[::-1])[::-1]
+    return ~valid & (after - before <= MAX_RECONSTRUCTED_ROWS + 1)
+
+
+def _interpolate(values: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """Replace the values that are not known by a cubic spline through the others."""
+    if known.all():
+        return values
+    rows, filled = np.arange(len(values)), values.copy()
+    filled[~known] = CubicSpline(rows[known], values[known])(rows[~known])
+    return filled
 
 
 def _flag_rows_after_gaps(valid: np.ndarray, rest: int) -> np.ndarray:
@@ -127,13 +154,15 @@ def _flag_rows_after_gaps(valid: np.ndarray, rest: int) -> np.ndarray:
 def average_periods(command: np.ndarray, output: np.ndarray, valid: np.ndarray, period: float) -> Spectrum:
     """Compute the spectra of a periodic command from arrays of shape (periods, rows) [m].
 
-    Every row of the period must be valid in at least two periods.
+    Rows that are not valid in any period are interpolated.
     """
     count, size = command.shape
     valid_count = valid.sum(axis=0)
     counted = np.maximum(valid_count, 1)
-    mean = np.where(valid, output, 0.0).sum(axis=0) / counted
-    input_mean = np.where(valid, command, 0.0).sum(axis=0) / counted
+    mean, input_mean = (
+        _interpolate(np.where(valid, values, 0.0).sum(axis=0) / counted, valid_count > 0)
+        for values in (output, command)
+    )
     rest = np.where(valid, output - mean, 0.0)
     degrees_of_freedom = float(valid.sum() - np.sum(valid_count > 0))
     noise = float(np.sqrt(np.sum(rest**2) / max(degrees_of_freedom, 1.0)))
@@ -141,11 +170,17 @@ def average_periods(command: np.ndarray, output: np.ndarray, valid: np.ndarray, 
     spread = np.sum(np.abs(np.fft.rfft(rest, axis=1) / size) ** 2, axis=0)
     # The variance of a mean over n periods is 1/n of the variance of a reading.
     variance = spread / max(degrees_of_freedom / size, 1e-9) * np.mean(1.0 / counted)
-    variance = _smooth(variance)
+    # Without noise, rounding is the same in all periods, so that their differences do not show it.
+    variance = np.maximum(_smooth(variance), _compute_rounding_variance(output[valid]) / size)
     number = np.arange(len(U))
     excited = (np.abs(U) > MIN_AMPLITUDE_SHARE * np.abs(U[1:]).max()) & (number > 0)
     excited[len(U) - (size % 2 == 0) :] = False
     return _add_distortion(U, Y, variance, excited, number / (size * period), noise, count)
+
+
+def _compute_rounding_variance(readings: np.ndarray) -> float:
+    """Return the variance of the rounding error of readings, at least that of float64."""
+    return max(detect_resolution(readings), float(np.spacing(np.abs(readings).max()))) ** 2 / 12.0
 
 
 def _add_distortion(U, Y, variance, excited, frequency, noise, count) -> Spectrum:
@@ -183,8 +218,8 @@ def _smooth(variance: np.ndarray) -> np.ndarray:
     return np.concatenate([[variance[0]], np.convolve(padded, kernel, "valid")[: len(variance) - 1]])
 
 
-def fit_local_polynomials(command: np.ndarray, output: np.ndarray, period: float) -> Spectrum:
-    """Compute the spectra of a non-periodic command by the local polynomial method."""
+def fit_local_polynomials(command: np.ndarray, output: np.ndarray, period: float) -> Spectrum | None:
+    """Compute the spectra of a non-periodic command by the local polynomial method; None without lines."""
     size = len(command)
     level = command[0]
     U, Y = np.fft.rfft(command - level) / size, np.fft.rfft(output - level) / size
@@ -193,6 +228,8 @@ def fit_local_polynomials(command: np.ndarray, output: np.ndarray, period: float
     middle = middle[power[middle] > MIN_POWER_SHARE * power[1:].max()]
     # If a periodic command has too few periods for an average, every second line has no power.
     middle = middle[np.abs(U[middle]) ** 2 > MIN_POWER_SHARE * power[middle]]
+    if len(middle) < 2:
+        return None
     width = 2 * SIDE_LINES + 1
     r = np.arange(-SIDE_LINES, SIDE_LINES + 1) / SIDE_LINES
     powers = r[:, None] ** np.arange(POLYNOMIAL_DEGREE + 1)

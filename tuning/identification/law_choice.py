@@ -30,7 +30,11 @@ from tuning.identification.contact_profile import estimate_surface_from_onset
 from tuning.identification.deep_contact import select_representative_lanes
 from tuning.identification.force_readings import ForceReadings
 from tuning.identification.motion import MotionResponse
-from tuning.identification.surface_search import find_best_surface
+from tuning.identification.surface_search import (
+    MIN_LIKELIHOOD_GAIN,
+    find_best_surface,
+    has_onset_damping,
+)
 
 MIN_CONTACTS_FOR_CROSS_VALIDATION = 4  # minimum number of contacts for cross-validation
 # Maximum deficit of an acceptable law in log likelihood, in standard errors of the deficit.
@@ -64,7 +68,7 @@ def choose_contact_law(
     lanes = select_representative_lanes(ContactProblem(motion, readings, kelvin_voigt(), plane))
     few_lanes, few_readings = motion.of(lanes), readings.select_lanes(lanes)
     is_same, fitted_families = len(lanes) == readings.force.shape[1], {}
-    _, plane_there, _ = guess = _fit_coarsely(motion, readings, kelvin_voigt(), plane, None)
+    _, plane_there, _ = guess = _fit_coarsely(few_lanes, few_readings, kelvin_voigt(), plane, None)
     test_readings = replace(readings, counts=readings.counts & ~flag_rows_near_edges(motion, readings, guess))
     deepest = float(np.max(motion.at(guess[0])[0][readings.counts])) - plane_there
     for family in list_law_families(deepest, len(readings.entries), names):
@@ -111,14 +115,6 @@ def choose_contact_law(
         )
         chosen = replace(chosen, law=law, delay=delay, plane=at, misfit=misfit)
     return [chosen, *sorted(others, key=lambda fit: fit.likelihood_deficit[0])]
-
-
-def has_onset_damping(law: Law) -> bool:
-    """Return whether the law has damping at zero depth, so that the force jumps at the onset of contact."""
-    surface, rate = np.zeros(1), np.ones(1)
-    return any(
-        np.any(value != 0.0) for value in (*law.entry_functions(surface, rate), *law.shared(surface, rate))
-    )
 
 
 CoarseFit = tuple[float, float, float]  # delay [s], surface position [m], and chi-squared
@@ -179,18 +175,34 @@ def search_coarsely(problem: ContactProblem, guess: CoarseFit | None = None, rea
         )
         delays = np.arange(problem.min_delay, MAX_FORCE_DELAY, 2.0 * COARSE_DELAY_STEP)
     else:
-        steps = np.array([step for step in (-4, -2, -1, 0, 1, 2, 4) if abs(step) <= reach])
         start = guess[1]
-        delays = np.clip(guess[0] + COARSE_DELAY_STEP * steps, problem.min_delay, MAX_FORCE_DELAY)
-    best = (0.0, start, np.inf)
-    for width in (0.0, COARSE_DELAY_STEP, COARSE_DELAY_STEP / 4.0):
-        if width:
-            delays = best[0] + width * np.array([-1.0, -0.5, 0.5, 1.0])
-            delays = np.clip(delays, problem.min_delay, MAX_FORCE_DELAY)
-        for delay in delays:
-            plane, inner, gain = find_best_surface(problem, float(delay), best[1])
-            if inner.misfit - 2.0 * gain < best[2]:
-                best = (float(delay), plane, inner.misfit - 2.0 * gain)
+        delays = guess[0] + COARSE_DELAY_STEP * np.array([-4, -2, -1, 0, 1, 2, 4])
+        delays = delays[np.abs(delays - guess[0]) <= (reach + 0.5) * COARSE_DELAY_STEP]
+    # Near a guess, only the last delays are worth the time to find the best surface among its local optima.
+    best = _search_delays(problem, delays, (0.0, start, np.inf), guess is None)
+    for width, is_last in ((COARSE_DELAY_STEP, False), (COARSE_DELAY_STEP / 4.0, True)):
+        delays = best[0] + width * np.array([-1.0, -0.5, 0.5, 1.0])
+        best = _search_delays(problem, delays, best, guess is None or is_last)
+    return best
+
+
+def search_far(problem: ContactProblem, guess: CoarseFit) -> CoarseFit:
+    """Search as `search_coarsely` does, and go on from its result as long as the fit clearly improves."""
+    best = search_coarsely(problem, guess, 2)
+    while best[2] < guess[2] - 2.0 * MIN_LIKELIHOOD_GAIN and abs(best[0] - guess[0]) > COARSE_DELAY_STEP:
+        guess, best = best, min(best, search_coarsely(problem, best, 2), key=lambda fit: fit[2])
+    return best
+
+
+def _search_delays(
+    problem: ContactProblem, delays: np.ndarray, best: CoarseFit, is_thorough: bool
+) -> CoarseFit:
+    """Return the best fit at one of the delays [s], or `best` if it is better."""
+    for delay in np.clip(delays, problem.min_delay, MAX_FORCE_DELAY):
+        enough = best[2] if is_thorough else -np.inf
+        plane, inner, gain = find_best_surface(problem, float(delay), best[1], enough)
+        if inner.misfit - 2.0 * gain < best[2]:
+            best = (float(delay), plane, inner.misfit - 2.0 * gain)
     return best
 
 

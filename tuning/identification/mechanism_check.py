@@ -25,6 +25,7 @@ from tuning.identification.force_readings import ForceReadings
 from tuning.identification.free_motion import FreeMotion
 from tuning.identification.hidden_filter import check_hidden_filter
 from tuning.identification.motion import MotionResponse
+from tuning.identification.motion_in_contact import check_motion_in_contact
 from tuning.identification.noise import NoiseEstimate
 from tuning.identification.rational import MotionModel
 from tuning.identification.records import Campaign, LoggedRun
@@ -92,6 +93,7 @@ def check_against_mechanism(
         lag = contacts.compute_force_lag(contact, model, frequency)
         flags = np.ones(len(touching), bool)
         lines += validation.check_contact_model(contact, touching, mass, frequency, lag, flags)
+        lines += check_motion_in_contact(contact, touching, frequency)
         lines += [*check_cut_dead_zone(contact, touching), *check_zone_sampling(mechanism)]
     effect = compute_uncertainty_effect(mechanism)
     if contact is not None and not _has_uncertain_dead_zone(mechanism):

@@ -191,6 +191,15 @@ def detect_quantum(readings: np.ndarray) -> float:
     return float(quantum) if np.all(np.abs(gaps / quantum - multiples) < 0.02) else 0.0
 
 
+def detect_resolution(values: np.ndarray) -> float:
+    """Return the step to whose multiples the values are rounded, or 0 if they are not rounded."""
+    steps = np.diff(np.unique(values[np.isfinite(values)]))
+    if not len(steps):
+        return 0.0
+    least = float(np.min(steps))
+    return least if np.median(np.abs(steps / least - np.rint(steps / least))) < 0.01 else 0.0
+
+
 def _fit_rounded_normal(readings: np.ndarray, quantum: float) -> tuple[float, float]:
     """Estimate mean and standard deviation of rounded normal values by maximum likelihood."""
     values, counts = np.unique(np.round(readings / quantum), return_counts=True)

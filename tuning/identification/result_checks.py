@@ -16,6 +16,7 @@ from tuning.identification.dead_zone_check import check_cut_dead_zone
 from tuning.identification.free_motion import FreeMotion
 from tuning.identification.mechanism_check import check_against_mechanism, check_file_uncertainty
 from tuning.identification.mechanism_file import to_toml
+from tuning.identification.motion_in_contact import check_motion_in_contact
 from tuning.identification.options import IdentificationOptions
 from tuning.identification.rational import MotionModel
 from tuning.identification.records import CONTACT_KINDS, Campaign, LoggedRun
@@ -105,6 +106,7 @@ def _check_fits(
         lines += [
             validation.check_stiffness_sign(contact),
             *validation.check_contact_model(contact, touching, mass, frequency, lag, all_touches),
+            *check_motion_in_contact(contact, touching, frequency),
             *check_cut_dead_zone(contact, touching),
         ]
     if written is not None:

@@ -25,6 +25,7 @@ def apply_filter(
     whitening: tuple[float, ...],
     onsets: Onsets | None = None,
     first: np.ndarray | None = None,
+    lost: np.ndarray | None = None,
 ) -> np.ndarray:
     """Apply a low-pass filter and a whitening filter to forces or regressors, along the last axis (rows).
 
@@ -35,6 +36,7 @@ def apply_filter(
         whitening: Coefficients of the whitening filter.
         onsets: Onsets of contact between two rows, or None.
         first: Forces just after the onsets, shape (regressors, onsets), or None without onsets.
+        lost: Flags of the rows whose reading is lost (`subtract_weighted_mean`), or None.
     """
     total: Any = 0.0
     for mode_rate, weight in zip(modes.rates, modes.weights, strict=True):
@@ -48,7 +50,8 @@ def apply_filter(
             drive[onsets.plane, :, onsets.row] = (after * first + end * then).T
         lagged: Any
         if len(whitening) > LONG_FILTER:
-            lagged = subtract_weighted_mean(np.asarray(lfilter([1.0], [1.0, -pole], drive)), whitening)
+            lagged = np.asarray(lfilter([1.0], [1.0, -pole], drive))
+            lagged = subtract_weighted_mean(lagged, whitening, lost)
         else:
             lagged = lfilter(whitening, [1.0, -pole], drive)
         total = total + (weight * lagged if weight.imag else weight.real * lagged).real

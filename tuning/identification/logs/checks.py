@@ -19,6 +19,7 @@ from tuning.identification.logs.scales import (
     check_impulse,
     estimate_force_beside_contacts,
 )
+from tuning.identification.noise import detect_resolution
 
 MIN_LOG_ROWS = 200  # minimum number of rows in a log
 MIN_FAR_SIDE_CONTACT_GAP = 0.01  # minimum time between two contacts at the second surface of a clearance [s]
@@ -29,6 +30,7 @@ USUAL_STROKE = 1.0  # largest range of positions without a note [m]; for press r
 MAX_STROKE = 20.0  # largest plausible range of positions [m]
 MIN_STROKE = 1e-5  # smallest plausible range of positions [m]
 MAX_SPEED = 5.0  # largest plausible speed [m/s]
+FIRST_PEAK_SHARE = 0.8  # minimum ratio of the first large peak of a correlation to the largest peak
 MAX_POSITION_LAG = 400  # longest delay between position command and reading in the search [ticks]
 MAX_REPEATED_SHARE = 0.4  # maximum share of repeated readings without a note
 MAX_HOLD_ROWS = 20  # maximum number of rows for which a reading is held
@@ -186,16 +188,9 @@ def find_change_interval(values: np.ndarray) -> int:
         return 1
     usual = int(np.median(apart))
     # Rounded values of a uniform motion also change regularly, by one unit of their last digit.
-    coarse = np.median(np.abs(steps[steps != 0.0])) <= 4 * _detect_resolution(values)
+    coarse = np.median(np.abs(steps[steps != 0.0])) <= 4 * detect_resolution(values)
     is_held = 1 < usual <= MAX_HOLD_ROWS and np.mean(apart == usual) > MIN_REGULAR_SHARE and not coarse
     return usual if is_held else 1
-
-
-def _detect_resolution(values: np.ndarray) -> float:
-    """Return the step to whose multiples the values are rounded, or 0 if they are not rounded."""
-    steps = np.diff(np.unique(values[np.isfinite(values)][:MAX_EVALUATED_ROWS]))
-    least = float(np.min(steps, initial=np.inf))
-    return least if np.median(np.abs(steps / least - np.rint(steps / least))) < 0.01 else 0.0
 
 
 def _check_size(label: str, kind: str, x: np.ndarray, measured: np.ndarray, period: float) -> list[str]:
@@ -238,14 +233,15 @@ def _check_following(label: str, kind: str, x: np.ndarray, measured: np.ndarray)
     size = 2 ** int(np.ceil(np.log2(2 * len(command))))
     spectrum = np.fft.rfft(reading, size) * np.conj(np.fft.rfft(command, size))
     correlation = np.fft.irfft(spectrum, size)[lags] / scale
-    best = np.argmax(np.abs(correlation))
-    lag, strength = int(lags[best]), float(correlation[best])
-    if abs(strength) < MIN_SPEED_CORRELATION:
-        return [f"{label}: position_measured: hardly follows position_desired (correlation {strength:.2g})"]
-    if strength < 0:
+    best = int(np.argmax(np.abs(correlation)))
+    if abs(correlation[best]) < MIN_SPEED_CORRELATION:
+        strength = f"{correlation[best]:.2g}"
+        return [f"{label}: position_measured: hardly follows position_desired (correlation {strength})"]
+    if correlation[best] < 0 and correlation[_find_first_peak(correlation, lags)] < 0:
         raise InputError(
             f"{label}: position_measured: found a motion against position_desired, expected the same sign"
         )
+    lag = int(lags[np.argmax(correlation)])
     if lag <= -2:
         finding = f"a motion {-lag} ticks earlier than position_desired"
         raise InputError(
@@ -255,9 +251,21 @@ def _check_following(label: str, kind: str, x: np.ndarray, measured: np.ndarray)
     return []
 
 
+def _find_first_peak(correlation: np.ndarray, lags: np.ndarray) -> int:
+    """Return the index of the first large peak of either sign for which the reading is not early.
+
+    A short run of almost a single frequency has peaks of alternating sign, half a period apart.
+    """
+    size = np.abs(correlation)
+    peaks = 1 + np.flatnonzero((size[1:-1] >= size[:-2]) & (size[1:-1] >= size[2:]))
+    late = peaks[lags[peaks] >= -1]
+    large = late[size[late] >= FIRST_PEAK_SHARE * np.max(size[late], initial=0.0)]
+    return int(large[0]) if len(large) else int(np.argmax(size))
+
+
 def _note_held_readings(label: str, x: np.ndarray, measured: np.ndarray) -> list[str]:
     """Return a note if many position readings equal the previous one although the command changes."""
-    moving = np.abs(np.diff(x)) > _detect_resolution(measured)
+    moving = np.abs(np.diff(x)) > detect_resolution(measured)
     if np.count_nonzero(moving) < MIN_LOG_ROWS // 2:
         return []
     share = float(np.mean(np.diff(measured)[moving] == 0.0))
