@@ -86,6 +86,11 @@ KINDS = {
     "cut_dead_zone_stated": Kind(
         lambda rng, rig: {"dead_zone": rng.uniform(1.0, 6.0), "cut": True}, states_cut=True
     ),
+    "lag_and_dead_zone": Kind(lambda rng, rig: {**_lag(rng, rig), **_dead_zone(rng, rig)}),
+    "lag_and_dead_zone_unknown": Kind(
+        lambda rng, rig: {**_lag(rng, rig), **_dead_zone(rng, rig)},
+        unknown=("rig.force_sensor.time_constant", "rig.force_sensor.dead_zone"),
+    ),
     "bias_walk": Kind(walk=0.7, defect=("bias", "drift", "noise")),
     "bias_walk_stated": Kind(walk=0.7, states_walk=True),
     "mode": Kind(

@@ -231,9 +231,18 @@ def test_poles_of_motion_model_far_above_measured_frequencies_are_limited(logari
     """A pole of 1e134 rad/s would make the motion overflow."""
     structure = rational.STRUCTURES[2]
     asked = np.array([*logarithms, 0.001])
-    bounded = rational._limit_fast_poles(structure, asked)
+    bounded = rational._limit_fast_poles(structure, asked, rational.MIN_TIME_CONSTANT)
     s = 2j * np.pi * np.array([0.5, 5.0, 50.0])
     responses = [rational.MotionModel(structure, values).response(s) for values in (bounded, asked)]
     np.testing.assert_allclose(*responses, rtol=1e-3)
     fastest = np.abs(np.roots(rational.MotionModel(structure, bounded).fraction[1])).max()
     assert fastest <= 1.001 / rational.MIN_TIME_CONSTANT
+
+
+def test_limit_of_fast_poles_keeps_delay_at_low_frequencies():
+    model = SECOND.structure.make_model(np.array([np.log(7e4), np.log(1.2), 0.0043]))
+    limited = rational._limit_fast_poles(model.structure, model.parameters, 1.8e-5)
+    s = 2j * np.pi * np.array([0.5, 5.0, 50.0])
+    responses = [rational.MotionModel(model.structure, p).response(s) for p in (limited, model.parameters)]
+    assert np.exp(limited[0]) < 1.001 / 1.8e-5
+    np.testing.assert_allclose(*np.angle(responses), rtol=0, atol=1e-5)

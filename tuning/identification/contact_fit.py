@@ -117,7 +117,7 @@ def fit_contact(
         evaluated = tuple(choose_contact_law(motion, readings, plane, None if law is None else (law,)))
         law, near = evaluated[0].law, (evaluated[0].delay, evaluated[0].plane)
     laws = (law, kelvin_voigt()) if evaluated and law.pulls else (law,)
-    problem, posterior = _fit_laws(motion, readings, laws, plane, near, noise_is_hidden, seed)
+    problem, posterior = _fit_laws(motion, readings, laws, plane, near, seed)
     law = problem.law
     is_visible = not (readings.zone or _has_dead_zone(posterior))
     if noise_is_hidden and is_visible and not _is_silent_outside(runs, problem, posterior):
@@ -127,7 +127,7 @@ def fit_contact(
         # The surface position is only an assumption, so readings near onset and release must not determine
         # delay and damping.
         readings = _drop_readings_near_edges(problem, posterior)
-        problem, posterior = _fit_laws(motion, readings, (law,), plane, None, noise_is_hidden, seed)
+        problem, posterior = _fit_laws(motion, readings, (law,), plane, None, seed)
         posterior = _add_surface_uncertainty(posterior, seed)
     degrees_of_freedom = len(problem.used_rows) - len(posterior.names)
     error = 0.0 if noise is None or noise_is_hidden else noise.std_std / max(noise.std, 1e-300)
@@ -192,7 +192,6 @@ def _fit_laws(
     laws: Sequence[Law],
     plane: float | None,
     near: tuple[float, float] | None,
-    noise_is_hidden: bool,
     seed: int,
 ) -> tuple[ContactProblem, Posterior]:
     """Fit the candidate laws; average the best posterior over models with and without damping.
@@ -203,20 +202,19 @@ def _fit_laws(
         laws: Candidate laws.
         plane: Position of the surface [m], or None to estimate it.
         near: Approximate delay [s] and surface position [m], or None.
-        noise_is_hidden: Whether a dead zone hides the noise at rest.
         seed: Seed of the random numbers.
 
     Returns:
         The contact problem of the chosen law and the posterior.
     """
     # An unmodelled sensor lag looks like a contact that pulls, so each law is fitted together with a lag.
-    fits = [(_fit_law(motion, readings, law, plane, near, noise_is_hidden, seed), law) for law in laws]
+    fits = [(_fit_law(motion, readings, law, plane, near, seed), law) for law in laws]
     (problem, posterior, lag, evidence), law = max(reversed(fits), key=lambda fit: fit[0][3])
     if lag is not None:
         problem, posterior = problem.changed(law, lag.value), lag.posterior
 
     def without_damping(law: Law) -> tuple[Posterior, float]:
-        _, alone, lagging, evidence = _fit_law(motion, readings, law, plane, near, noise_is_hidden, seed)
+        _, alone, lagging, evidence = _fit_law(motion, readings, law, plane, near, seed)
         return alone if lagging is None else lagging.posterior, evidence
 
     posterior = damping_average.average_over_damping(problem, posterior, evidence, without_damping)
@@ -256,16 +254,15 @@ def _fit_law(
     law: Law,
     plane: float | None,
     near: tuple[float, float] | None,
-    noise_is_hidden: bool,
     seed: int,
 ) -> tuple[ContactProblem, Posterior, SensorLag | None, float]:
-    """Fit one law with the prior's filter or else a sensor lag; with neither if a dead zone hides onsets."""
+    """Fit one law with the prior's filter or, without a filter, with and without a sensor lag."""
     problem = summarise_deep_lanes(ContactProblem(motion, readings, law, plane), near)
     if readings.time_constant:
         lag = estimate_stated_filter(problem, near, seed)
         return problem, lag.posterior, lag, lag.evidence
     posterior = compute_posterior(problem, seed, near)
-    lag = None if noise_is_hidden else estimate_sensor_lag(problem, posterior, seed)
+    lag = estimate_sensor_lag(problem, posterior, seed)
     return (
         problem,
         posterior,

@@ -303,20 +303,13 @@ class ContactProblem:
             design[:, -1] = flags[0] / std if self.has_dead_zone else 1.0 / std
             return design, self.whitened[rows]
         tables = [part.columns * (flag[:, None] / std) for part, flag in zip(near, flags, strict=True)]
-        if self.has_dead_zone:
-            tables = [
-                np.concatenate([table, flag[:, None] / std], axis=1)
-                for table, flag in zip(tables, flags, strict=True)
-            ]
         if onsets is not None:
-            first = np.vstack([onsets.columns, np.ones((int(self.has_dead_zone), len(onsets.row)))])
-            first *= flags[0][onsets.plane, onsets.row] / std
+            first = onsets.columns * flags[0][onsets.plane, onsets.row] / std
         used = self.is_used[rows]
         design = np.compress(used, self._filter(rows, tables, onsets, first, self.readings.whitening), axis=2)
-        if not self.has_dead_zone:
-            bias = np.full((len(design), 1, design.shape[2]), self.bias_alone)
-            design = np.concatenate([design, bias], axis=1)
-        return design, self.whitened[rows[used]]
+        # Bias and dead zone act on the filtered force. Fits use only readings beyond a dead zone.
+        bias = np.full((len(design), 1, design.shape[2]), float(np.sum(self.readings.whitening)) / std)
+        return np.concatenate([design, bias], axis=1), self.whitened[rows[used]]
 
     def _solve(self, near, flags, onsets, pseudo: PseudoRows | None) -> LeastSquaresFit:
         """Fit the coefficients at each surface position; `flags` marks the rows of `near` in contact."""
@@ -385,14 +378,20 @@ class ContactProblem:
 
     def _predict(self, near, flags, onsets, coefficients, whitening) -> np.ndarray:
         """Predict whitened readings [N], (surface positions, rows), without a bias that all rows share."""
-        offset, first = self.has_dead_zone * coefficients[-1], None
+        first = None
         tables = [
-            ((compute_force(coefficients, part.columns) + offset) * flag)[:, None]
+            (compute_force(coefficients, part.columns) * flag)[:, None]
             for part, flag in zip(near, flags, strict=True)
         ]
         if onsets is not None:
-            first = (coefficients[:-1] @ onsets.columns + offset) * flags[0][onsets.plane, onsets.row]
-        return self._filter(near[0].rows, tables, onsets, first, whitening)[:, 0]
+            first = coefficients[:-1] @ onsets.columns * flags[0][onsets.plane, onsets.row]
+        force = self._filter(near[0].rows, tables, onsets, first, whitening)[:, 0]
+        if not self.has_dead_zone:
+            return force
+        offset = coefficients[-1]
+        # After the release, the filtered force decays until the dead zone hides it.
+        is_visible = force > max(-offset, 0.0) if self.time_constant else flags[0]
+        return force + offset * is_visible
 
     def touching(self, delay: float, plane: float, coefficients: np.ndarray) -> np.ndarray:
         """Return flags of the rows that are in contact according to the model, shape (rows, lanes)."""

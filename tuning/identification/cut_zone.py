@@ -101,5 +101,7 @@ def _log_probability_of_zero(force, std: float, zone: float):
 def _take_readings_before_contact(run: LoggedRun) -> np.ndarray:
     """Return the first half of the readings that precede the first large force."""
     force = run.valid_forces
+    if not len(force):
+        return force
     loud = np.abs(force) > MIN_LOUD_SHARE * np.abs(force).max(initial=0.0)
     return force[: int(np.argmax(loud)) // 2]

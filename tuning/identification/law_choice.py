@@ -40,6 +40,8 @@ MIN_CONTACTS_FOR_CROSS_VALIDATION = 4  # minimum number of contacts for cross-va
 # Maximum deficit of an acceptable law in log likelihood, in standard errors of the deficit.
 MAX_LIKELIHOOD_DEFICIT_ERRORS = 2.0
 ONSET_DAMPING_EXCLUSION_ERRORS = 4.0  # minimum deficit that excludes onset damping, in standard errors
+MAX_PARABOLAS = 4  # maximum number of parabolas in a precise search of the delay
+MIN_PARABOLA_DECREASE = 0.2  # decrease of chi-squared below which the precise search ends
 ONSET_MARGIN = 1e-3  # the evaluation omits rows within this time of an onset or a release [s]
 
 
@@ -186,11 +188,27 @@ def search_coarsely(problem: ContactProblem, guess: CoarseFit | None = None, rea
     return best
 
 
-def search_far(problem: ContactProblem, guess: CoarseFit) -> CoarseFit:
-    """Search as `search_coarsely` does, and go on from its result as long as the fit clearly improves."""
+def search_precisely(problem: ContactProblem, guess: CoarseFit) -> CoarseFit:
+    """Search the best fit near a guess so precisely that fits with different lags can be compared.
+
+    The search goes on beyond the delays of `search_coarsely` as long as the fit clearly improves. A parabola
+    then gives the delay between the coarse steps, which matters if many readings determine the delay to less
+    than a step.
+    """
     best = search_coarsely(problem, guess, 2)
     while best[2] < guess[2] - 2.0 * MIN_LIKELIHOOD_GAIN and abs(best[0] - guess[0]) > COARSE_DELAY_STEP:
         guess, best = best, min(best, search_coarsely(problem, best, 2), key=lambda fit: fit[2])
+    step = COARSE_DELAY_STEP / 8.0
+    for _ in range(MAX_PARABOLAS):
+        start = (*best[:2], np.inf)
+        sides = [_search_delays(problem, best[0] + np.array([side]), start, False) for side in (-step, step)]
+        rise, slope = sides[0][2] + sides[1][2] - 2.0 * best[2], sides[0][2] - sides[1][2]
+        shift = np.clip(0.5 * slope / rise, -1.0, 1.0) if rise > 0.0 else 0.0
+        if rise * shift**2 < 2.0 * MIN_PARABOLA_DECREASE:
+            break
+        vertex = best[0] + np.array([shift * step])
+        best = _search_delays(problem, vertex, min(*sides, best, key=lambda fit: fit[2]), True)
+        step /= 2.0
     return best
 
 

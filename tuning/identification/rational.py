@@ -19,10 +19,12 @@ import numpy as np
 from numpy.polynomial import polynomial
 from scipy import optimize
 
+from jaxhil.simulation.cells import MAX_POLE
 from tuning.identification import hold as holds
 
 MEMORY_TIME_CONSTANTS = 10.0  # time constants after which a command has no effect
 MIN_TIME_CONSTANT = 1e-6  # minimum time constant [s]; logs cannot resolve faster poles
+POLE_SHARE = 0.9  # largest pole, divided by the largest one that simulations accept
 
 
 @dataclass(frozen=True)
@@ -235,19 +237,23 @@ def _refine_fit(structure: SimulatorStructure, start: np.ndarray, lines: Spectra
     covariance = np.linalg.pinv(curvature / np.outer(scales, scales), hermitian=True) / np.outer(
         scales, scales
     )
-    half, parameters = len(lines), _limit_fast_poles(structure, result.x)
+    least = max(MIN_TIME_CONSTANT, lines.period / (POLE_SHARE * MAX_POLE))
+    half, parameters = len(lines), _limit_fast_poles(structure, result.x, least)
     left = residual(parameters)
     return SpectrumFit(
         structure.make_model(parameters), covariance, (left[:half] + 1j * left[half:]) / np.sqrt(2.0)
     )
 
 
-def _limit_fast_poles(structure: SimulatorStructure, parameters: np.ndarray) -> np.ndarray:
-    """Limit the magnitude of all poles to 1 / `MIN_TIME_CONSTANT`; return the changed parameters."""
+def _limit_fast_poles(structure: SimulatorStructure, parameters: np.ndarray, least: float) -> np.ndarray:
+    """Limit the magnitude of all poles to 1 / `least`; return the changed parameters.
+
+    The delay changes so that the sum of the delay and all lags at low frequencies stays the same.
+    """
     first, order = structure.first, structure.order
-    times = np.maximum(parameters[:first], np.log(MIN_TIME_CONSTANT))
+    times = np.maximum(parameters[:first], np.log(least))
     sections = []
-    fastest = -np.log(MIN_TIME_CONSTANT)
+    fastest = -np.log(least)
     for frequency, ratio in parameters[first:order].reshape(-1, 2):
         if ratio > 0.0:  # damping ratio above 1: the section has two real poles; return their logarithms
             slower = frequency - ratio - np.log1p(np.sqrt(1.0 - np.exp(-2.0 * ratio)))
@@ -256,7 +262,16 @@ def _limit_fast_poles(structure: SimulatorStructure, parameters: np.ndarray) -> 
             ratio = np.logaddexp(slower, faster) - np.log(2.0) - frequency
         frequency = min(frequency, fastest)
         sections += [frequency, ratio]
-    return np.array([*times, *sections, *parameters[order:]])
+    limited = np.array([*times, *sections, *parameters[order:]])
+    limited[-1] += _compute_low_frequency_lag(structure, parameters)
+    limited[-1] -= _compute_low_frequency_lag(structure, limited)
+    return limited
+
+
+def _compute_low_frequency_lag(structure: SimulatorStructure, parameters: np.ndarray) -> float:
+    """Return the delay [s] that the poles of a model cause at low frequencies."""
+    frequencies, ratios = parameters[structure.first : structure.order].reshape(-1, 2).T
+    return float(np.sum(np.exp(parameters[: structure.first])) + np.sum(2.0 * np.exp(ratios - frequencies)))
 
 
 def estimate_low_frequency_delay(lines: SpectralLines) -> float:

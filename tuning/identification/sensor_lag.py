@@ -20,7 +20,7 @@ from scipy import optimize, special
 from tuning.identification.contact_problem import MAX_FORCE_DELAY, ContactProblem
 from tuning.identification.contact_profile import POSTERIOR_DRAWS, Posterior
 from tuning.identification.lag_profile import compute_posterior_near
-from tuning.identification.law_choice import CoarseFit, search_far
+from tuning.identification.law_choice import CoarseFit, search_precisely
 
 MAX_TIME_CONSTANT = 0.005  # longest time constant of a lag [s]
 TRIAL_TIME_CONSTANTS = 0.0005, 0.0015, 0.004  # time constants of a first search [s]
@@ -67,7 +67,7 @@ def estimate_sensor_lag(problem: ContactProblem, posterior: Posterior, seed: int
         if value not in fits:
             start = (max(delay - value, problem.min_delay), plane, inner.misfit)
             lagging = problem.changed(problem.law, value, start[0])
-            fits[value] = lagging, search_far(lagging, start)
+            fits[value] = lagging, search_precisely(lagging, start)
         return fits[value]
 
     def fit(value: float) -> CoarseFit:

@@ -15,7 +15,7 @@ import numpy as np
 from scipy import optimize
 
 from tuning.identification.contact_problem import MAX_FORCE_DELAY, ContactProblem
-from tuning.identification.law_choice import CoarseFit, search_coarsely
+from tuning.identification.law_choice import CoarseFit, search_coarsely, search_precisely
 from tuning.identification.sensor_lag import (
     DELAY_GRID_SIZE,
     MAX_TIME_CONSTANT,
@@ -58,7 +58,7 @@ def estimate_stated_filter(
             delay = delay + (nearest - value) * modes.delay
             delay = float(np.clip(delay, problem.min_delay, MAX_FORCE_DELAY))
             changed = problem.changed(problem.law, value, delay)
-            fits[value] = changed, search_coarsely(changed, (delay, plane, misfit), 2)
+            fits[value] = changed, search_precisely(changed, (delay, plane, misfit))
         return fits[value]
 
     def misfit(value: float) -> float:

@@ -166,7 +166,7 @@ class _RunsOfFile:
         cuts = find_restarts(x, channels["contact_index"])
         if modes is not None:
             cuts = np.union1d(cuts, np.flatnonzero(modes[1:] != modes[:-1]) + 1)
-        runs: list[LoggedRun] = []
+        segments: list[tuple[RunKind, LogSegment]] = []
         for segment in split_at_gaps(tick, channels, cuts, self._timing.control_period, self._mass):
             if len(segment.tick) < MIN_SEGMENT_ROWS:
                 self.notes.append(f"{self.label}: {len(segment.tick)} rows between gaps are omitted")
@@ -174,7 +174,12 @@ class _RunsOfFile:
             kind: RunKind = self.kind
             if modes is not None:
                 kind = KINDS[int(modes[np.searchsorted(tick, segment.tick[:1])][0])]
-            runs += self._make_runs(segment, kind)
+            segments.append((kind, segment))
+        # Check the longest part of each kind: a short part between two gaps may show too little of the motion.
+        longest = dict(sorted(segments, key=lambda entry: len(entry[1].tick)))
+        runs: list[LoggedRun] = []
+        for kind, segment in segments:
+            runs += self._make_runs(segment, kind, segment is longest[kind])
         if not runs:
             expected = (
                 f"at least {MIN_SEGMENT_ROWS} successive rows; for the kinds contact and tap, with a contact"
@@ -182,10 +187,14 @@ class _RunsOfFile:
             raise InputError(f"{self.label}: found no run in {len(tick)} rows, expected {expected}")
         return runs
 
-    def _make_runs(self, segment: LogSegment, kind: RunKind) -> list[LoggedRun]:
-        """Check a segment of the log and return its runs: one per contact, or a single run."""
+    def _make_runs(self, segment: LogSegment, kind: RunKind, has_motion: bool) -> list[LoggedRun]:
+        """Check a segment of the log and return its runs: one per contact, or a single run.
+
+        `has_motion` states whether the segment is long enough to check its motion.
+        """
         period, force = self._timing.control_period, segment.channels["force_measured"]
-        self.notes += checks.check_motion(self.label, kind, segment, period, self._timing.command_hold)
+        if has_motion:
+            self.notes += checks.check_motion(self.label, kind, segment, period, self._timing.command_hold)
         self._ignore_channel(segment, "velocity_desired", check_velocity(self.label, segment, period))
         if kind not in ("press", *KINDS_SPLIT_AT_CONTACTS):
             return [self._make_run(segment, kind, slice(None), None, None)]
