@@ -2,8 +2,8 @@
 
 `python tests/identify_study.py FILE [--first SEED] [--count N] [--kinds KIND ...]` appends one line of JSON
 per campaign to FILE and prints a summary of each kind. It omits campaigns that FILE contains already, so that
-an interrupted study continues. The kinds are those of `independent_logs` and, with the prefix "ambiguous ",
-those of `ambiguous_campaigns`.
+an interrupted study continues. The kinds are those of `independent_logs`, "mixture" (a random combination of
+their properties on a random rig) and, with the prefix "ambiguous ", those of `ambiguous_campaigns`.
 """
 
 import argparse
@@ -28,7 +28,7 @@ from tuning.identification.identify import IdentificationOptions, identify
 from tuning.identification.mechanism_check import check_against_mechanism
 
 AMBIGUOUS = {f"ambiguous {name}": name for name in ambiguous.KINDS}
-KINDS = (*independent_logs.KINDS, *AMBIGUOUS)
+KINDS = (*independent_logs.KINDS, independent_logs.MIXTURE, *AMBIGUOUS)
 
 
 def evaluate_ambiguous_identification(name, seed):

@@ -11,13 +11,14 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
+from independent_mixtures import draw_mixture
 from independent_rig import LOGGER, POINTS, Rig, drive, touch
 from pyarrow import csv, parquet
 from scipy.signal import lfilter
 
 RATES = (1000, 500, 2000)  # Hz
 DECIMALS = (3, 2, 1)  # decimals of forces in N; positions in m have six more
-REST, FREE, PRESS = 5.0, 60.0, 40.0  # s
+REST, PRESS = 5.0, 40.0  # s
 CLEARANCE = 0.03  # m between the surface and the middle of the free motion
 STROKE = 1.5e-3  # peak of the free motion [m]
 JITTER = 50e-6  # standard deviation of stamps [s]
@@ -42,6 +43,9 @@ class Kind:
     force_clock: bool = False  # the force has its own time stamps and begins later
     # linear interpolation of force readings to these time stamps before logging
     resampled: bool = False
+    repeats: int = 5  # contacts at each of three speeds
+    free: float = 60.0  # duration of the free motion [s]
+    noise: tuple[float, float] | None = None  # noise of force [N] and position [m]; drawn if None
     late: int = 0  # rows by which the measured position begins later; logs are Parquet with time stamps
 
 
@@ -61,6 +65,7 @@ def _butterworth(order):
     return lambda rng, rig: {"filter_order": order, "cutoff": rng.uniform(60, 250)}
 
 
+MIXTURE = "mixture"
 FILTER = ("lag", "filter", "delay", "contact law")
 KINDS = {
     "plain": Kind(),
@@ -108,6 +113,11 @@ KINDS = {
 }
 
 
+def get_kind(name, seed):
+    """Return the kind of a name; each seed draws its own mixture."""
+    return Kind(**draw_mixture(seed)) if name == MIXTURE else KINDS[name]
+
+
 @dataclass(frozen=True)
 class Campaign:
     """Campaign on disk, and the true rig."""
@@ -149,6 +159,8 @@ class Noise:
     def __init__(self, rng, kind, period):
         self.rng, self.kind, self.period = rng, kind, period
         self.force_noise, self.position_noise = rng.uniform(0.1, 0.5), rng.uniform(1e-6, 5e-6)
+        if kind.noise:
+            self.force_noise, self.position_noise = kind.noise
         if kind.noiseless:
             self.force_noise = self.position_noise = 0.0
         self.bias = rng.uniform(-0.4, 0.4)
@@ -169,15 +181,15 @@ class Noise:
 
 def free_motion(rng, kind, period):
     """Return the commands of a free motion around 0 that starts and ends smoothly within a second."""
-    time = np.arange(round(FREE / period)) * period
+    time = np.arange(round(kind.free / period)) * period
     if kind.sweep:
         low, high = 0.2, 30.0
-        rate = np.log(high / low) / FREE
+        rate = np.log(high / low) / kind.free
         motion = np.sin(2 * np.pi * low * np.expm1(rate * time) / rate)
         motion /= np.maximum(low * np.exp(rate * time) / 3.0, 1.0)
     else:
         motion = multisine(rng, time, 30.0)
-    return STROKE * motion / np.abs(motion).max() * _ends(time, FREE, 1.0)
+    return STROKE * motion / np.abs(motion).max() * _ends(time, kind.free, 1.0)
 
 
 def multisine(rng, time, highest):
@@ -221,7 +233,7 @@ def _lead(rig, rng, lanes):
 
 def write_campaign(kind_name, seed, folder):
     """Simulate a campaign of a kind, write it to a folder and return it."""
-    kind, rng = KINDS[kind_name], np.random.default_rng([seed, 2026])
+    kind, rng = get_kind(kind_name, seed), np.random.default_rng([seed, 2026])
     rig, speed = draw_rig(rng), rng.uniform(3e-3, 6e-3)
     form = Form(rng, kind)
     with_press = seed % 2 == 1
@@ -249,9 +261,9 @@ def write_campaign(kind_name, seed, folder):
     aside = replace(rig, mode=0.0)  # out of contact the structure moves with the drive
     open_loop("rest", np.full(round(REST / rig.period), -CLEARANCE), aside)
     open_loop("free", free_motion(rng, kind, rig.period) - CLEARANCE, aside)
-    speeds = speed * np.repeat([1.0, 2.0, 4.0], 5)
+    speeds = speed * np.repeat([1.0, 2.0, 4.0], kind.repeats)
     approach = rng.uniform(0.2, 0.3, len(speeds))
-    duration = 0.7 + np.pi * np.sqrt(rig.mass / rig.stiffness)
+    duration = max(0.7, (210 + kind.late) * rig.period) + np.pi * np.sqrt(rig.mass / rig.stiffness)
     ticks = round(duration / rig.period)
     noise, position_noise = sensors.draw(ticks, len(speeds))
     touches = touch(
@@ -296,8 +308,9 @@ class Form:
             keep[-1] = False
             columns |= {name: np.roll(columns[name], -1) for name in ("x_cmd", "v_cmd") if name in columns}
         if kind.lost:
+            jitter = min(JITTER, 0.1 * period)
             keep[1:] &= rng.random(len(rows) - 1) > kind.lost
-            columns["t"] = stamps + np.clip(rng.normal(0, JITTER, len(rows)), -4 * JITTER, 4 * JITTER)
+            columns["t"] = stamps + np.clip(rng.normal(0, jitter, len(rows)), -4 * jitter, 4 * jitter)
         if kind.late:
             keep[-kind.late :] = False
             columns |= {"x": np.roll(columns["x"], -kind.late), "t_x": stamps + kind.late * period}
@@ -368,6 +381,7 @@ def mechanism_file(rig, speed, kind, factors):
         "rig.force_sensor.delay": rig.force_delay * factors[4],
         "rig.force_sensor.time_constant": 1 / (2 * np.pi * rig.cutoff) if rig.filter_order == 1 else 0.0,
         "rig.force_sensor.dead_zone": rig.dead_zone,
+        "rig.position_sensor.delay": rig.position_delay,
     }
     if kind.states_filter:
         cutoff = rig.cutoff * factors[2]

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from unittest.mock import patch
 
 import numpy as np
-from independent_logs import KINDS, write_campaign
+from independent_logs import get_kind, write_campaign
 from independent_rig import ideal_restitution, restitution
 
 LIMIT = 0.01  # error of e or e - e* beyond which a file is wrong
@@ -115,7 +115,7 @@ def evaluate_identification(kind, seed, folder):
         message = " | ".join([message, *document["notes"]])
     elif verdict == "bad":
         verdict = "refused"
-    words = KINDS[kind].defect
+    words = get_kind(kind, seed).defect
     named = any(word in text for word in words) if words else len(text) > 0
     trouble = err if "internal error" in err or "Traceback" in err else ""
     return Outcome(kind, seed, verdict, message, check, e, float(error), float(difference), named, trouble,

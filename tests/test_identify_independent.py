@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from identify_study import evaluate, summarise
-from independent_logs import KINDS, mechanism_file, write_campaign
+from independent_logs import KINDS, MIXTURE, mechanism_file, write_campaign
 from independent_rig import Rig, drive, ideal_restitution, restitution, touch
 from independent_study import LIMIT, errors_of, evaluate_identification
 
@@ -114,7 +114,7 @@ def test_identify_names_defect_of_sensor_that_residuals_hardly_show(kind, seed, 
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", (*KINDS, MIXTURE))
 def test_identify_on_independent_simulator_never_calls_inaccurate_file_good(kind):
     outcomes = [evaluate(kind, seed) for seed in range(CAMPAIGNS)]
     print(summarise(kind, outcomes))

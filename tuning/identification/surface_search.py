@@ -13,6 +13,7 @@ from tuning.identification.contact_regression import CoefficientFit
 
 MAX_NEWTON_STEPS = 6  # maximum number of Newton steps in the search for a surface position
 MIN_LIKELIHOOD_GAIN = 2.0  # Newton's method stops when a step increases the log likelihood by less
+MAX_STEP = 0.01  # maximum Newton step [m]; without readings in contact, the steps are arbitrary
 MIN_EDGE_RESIDUAL = 4.0  # residual next to an onset [standard deviations] that suggests another step
 # Number of rows per onset that a wrong surface may misplace, to bound the decrease of the misfit by a scan.
 MAX_MISPLACED_ROWS = 5
@@ -75,11 +76,13 @@ def _take_newton_steps(
         if problem.plane is not None or inner.curvature <= 0.0:
             break
         shift = inner.slope / inner.curvature
+        if abs(shift) > MAX_STEP:
+            break
         gain = 0.5 * inner.slope * shift
         if gain < MIN_LIKELIHOOD_GAIN:
             return plane - shift, inner, gain
         moved = problem.at(delay, plane - shift)
-        if moved.misfit >= inner.misfit:
+        if not moved.misfit < inner.misfit:
             break
         plane, inner = plane - shift, moved
     return plane, inner, 0.0

@@ -227,8 +227,9 @@ def flag_certain_rows(contact: ContactFit) -> np.ndarray:
     In uncertain rows, residuals do not show an error of the law, because the force jumps at the onset.
     """
     count = len(contact.problem.names)
+    # Delays that include a lag may exceed the longest delay of the search.
     flags = [
-        contact.problem.touching(draw[0], draw[1], draw[2 : 2 + count])
+        contact.problem.touching(min(draw[0], MAX_FORCE_DELAY), draw[1], draw[2 : 2 + count])
         for draw in contact.posterior.draws[:CONTACT_STATE_DRAWS]
     ]
     return np.all(flags, axis=0) | ~np.any(flags, axis=0)

@@ -175,7 +175,7 @@ class _RunsOfFile:
             if modes is not None:
                 kind = KINDS[int(modes[np.searchsorted(tick, segment.tick[:1])][0])]
             segments.append((kind, segment))
-        # Check the longest part of each kind: a short part between two gaps may show too little of the motion.
+        # Check the longest part of each kind: a short one between two gaps may show too little of the motion.
         longest = dict(sorted(segments, key=lambda entry: len(entry[1].tick)))
         runs: list[LoggedRun] = []
         for kind, segment in segments:
