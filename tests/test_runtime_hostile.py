@@ -3,6 +3,7 @@
 import math
 import random
 import tracemalloc
+from itertools import pairwise
 
 import pytest
 from guarded import PERIOD, limited
@@ -67,10 +68,12 @@ def test_controller_memory_does_not_grow(name):
     tracemalloc.start()
     try:
         run(1000)
-        before = tracemalloc.get_traced_memory()[0]
+        sizes = [tracemalloc.get_traced_memory()[0]]
         for n in range(2, 6):
             run(1000 * n)
-        assert tracemalloc.get_traced_memory()[0] - before < 2000
+            sizes.append(tracemalloc.get_traced_memory()[0])
+        # A controller that keeps memory grows in every run; the test runner's threads do so now and then.
+        assert min(after - before for before, after in pairwise(sizes)) < 500
     finally:
         tracemalloc.stop()
     assert controller.status == "ok"

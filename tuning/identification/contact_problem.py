@@ -409,8 +409,8 @@ def _compute_filter_length(readings: ForceReadings) -> int:
     length = len(readings.whitening)
     if length <= LONG_FILTER:
         return length
-    kept = [np.flatnonzero(valid) for valid in readings.is_valid.T]
-    return max(int(np.max(rows[length:] - rows[:-length], initial=length)) for rows in kept)
+    valid_rows = [np.flatnonzero(valid) for valid in readings.is_valid.T]
+    return max(int(np.max(rows[length:] - rows[:-length], initial=length)) for rows in valid_rows)
 
 
 def _whiten(values: np.ndarray, whitening: Sequence[float], lost: np.ndarray) -> np.ndarray:

@@ -120,8 +120,8 @@ def compute_spectrum(
             return average_periods(
                 command[rows].reshape(shape), output[rows].reshape(shape), valid[rows].reshape(shape), period
             )
-    known = valid | _flag_short_gaps(valid)
-    first, length = _find_longest_run(known & ~_flag_rows_after_gaps(known, rest))
+    has_command = valid | _flag_short_gaps(valid)
+    first, length = _find_longest_run(has_command & ~_flag_rows_after_gaps(has_command, rest))
     if length < 50 * SIDE_LINES:
         return None
     rows = slice(first, first + length)
@@ -136,12 +136,12 @@ def _flag_short_gaps(valid: np.ndarray) -> np.ndarray:
     return ~valid & (after - before <= MAX_RECONSTRUCTED_ROWS + 1)
 
 
-def _interpolate(values: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """Replace the values that are not known by a cubic spline through the others."""
-    if known.all():
+def _interpolate(values: np.ndarray, valid: np.ndarray) -> np.ndarray:
+    """Replace the values that are not valid by a cubic spline through the others."""
+    if valid.all():
         return values
     rows, filled = np.arange(len(values)), values.copy()
-    filled[~known] = CubicSpline(rows[known], values[known])(rows[~known])
+    filled[~valid] = CubicSpline(rows[valid], values[valid])(rows[~valid])
     return filled
 
 
