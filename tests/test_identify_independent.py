@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from identify_study import evaluate, summarise
-from independent_logs import KINDS, MIXTURE, mechanism_file, write_campaign
+from independent_logs import KINDS, MIXTURE, write_campaign
+from independent_prior import mechanism_file
 from independent_rig import Rig, drive, ideal_restitution, restitution, touch
 from independent_study import LIMIT, errors_of, evaluate_identification
 

@@ -7,7 +7,6 @@ position ("plane"), the predicted force is a linear combination of the regressor
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 from functools import cached_property
 
@@ -24,7 +23,7 @@ from tuning.identification.contact_regression import (
     sum_and_squares,
     sum_products,
 )
-from tuning.identification.drifting_noise import LONG_FILTER, subtract_weighted_mean
+from tuning.identification.drifting_noise import whiten
 from tuning.identification.force_readings import ForceReadings
 from tuning.identification.motion import MotionResponse
 from tuning.identification.nearby_rows import NearbyRows, Onsets
@@ -73,9 +72,10 @@ class ContactProblem:
         self.has_dead_zone = bool(readings.threshold)
         # Value of a reading out of contact for a bias of 1 N, whitened and divided by the noise's standard
         # deviation.
-        self.bias_alone = 0.0 if self.has_dead_zone else float(np.sum(readings.whitening)) / readings.std
+        self.bias_column = float(np.sum(readings.whitening)) / readings.std
+        self.bias_alone = 0.0 if self.has_dead_zone else self.bias_column
         self.sums = sum_and_squares(self.target)
-        self.memory = _compute_filter_length(readings) + int(
+        self.memory = readings.filter_length + int(
             np.ceil(FILTER_MEMORY_TIME_CONSTANTS * time_constant / motion.period / readings.modes.slowest)
         )
         # Times at which the force is computed, in periods before a row. A lag integrates the force between
@@ -98,7 +98,7 @@ class ContactProblem:
     def whiten(self, values: np.ndarray) -> np.ndarray:
         """Apply the whitening filter along the rows of an array (..., rows, lanes)."""
         lost = self.readings.lost.T
-        return _whiten(values.swapaxes(-1, -2), self.readings.whitening, lost).swapaxes(-1, -2)
+        return whiten(values.swapaxes(-1, -2), self.readings.whitening, lost).swapaxes(-1, -2)
 
     def changed(self, law: Law, time_constant: float, delay: float | None = None) -> ContactProblem:
         """Return a copy of the problem with this contact law and this time constant of the sensor [s].
@@ -260,7 +260,7 @@ class ContactProblem:
         """
         lost = (rows >= 0) & self.readings.lost.ravel()[rows]
         if onsets is None or not tables[0].size:
-            return _whiten(tables[0], whitening, lost)
+            return whiten(tables[0], whitening, lost)
         return apply_filter(self.readings.modes, self.filter_rate, tables, whitening, onsets, first, lost)
 
     def inside(self, delay: float, planes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -281,11 +281,11 @@ class ContactProblem:
             drive = apply_filter(self.readings.modes, self.filter_rate, tables, whitening, lost=lost)
             drive /= self.readings.std
         else:
-            drive = _whiten(tables[0] / self.readings.std, whitening, lost)
+            drive = whiten(tables[0] / self.readings.std, whitening, lost)
         used = self.is_used[rows]
         design = np.empty((len(planes), drive.shape[1] + 1, len(self.used_rows)))
         np.compress(used, drive.reshape(*drive.shape[:2], -1), axis=2, out=design[:, :-1])
-        design[:, -1] = float(np.sum(self.readings.whitening)) / self.readings.std
+        design[:, -1] = self.bias_column
         return design, self.whitened[rows[used]]
 
     def _build_design(
@@ -308,7 +308,7 @@ class ContactProblem:
         used = self.is_used[rows]
         design = np.compress(used, self._filter(rows, tables, onsets, first, self.readings.whitening), axis=2)
         # Bias and dead zone act on the filtered force. Fits use only readings beyond a dead zone.
-        bias = np.full((len(design), 1, design.shape[2]), float(np.sum(self.readings.whitening)) / std)
+        bias = np.full((len(design), 1, design.shape[2]), self.bias_column)
         return np.concatenate([design, bias], axis=1), self.whitened[rows[used]]
 
     def _solve(self, near, flags, onsets, pseudo: PseudoRows | None) -> LeastSquaresFit:
@@ -402,21 +402,3 @@ class ContactProblem:
         flags = np.zeros(self.readings.force.size, bool)
         flags[near.rows[near.rows >= 0]] = flag[near.rows >= 0]
         return flags.reshape(self.readings.force.shape)
-
-
-def _compute_filter_length(readings: ForceReadings) -> int:
-    """Return the largest number of rows that the whitening filter combines, including lost ones it skips."""
-    length = len(readings.whitening)
-    if length <= LONG_FILTER:
-        return length
-    valid_rows = [np.flatnonzero(valid) for valid in readings.is_valid.T]
-    return max(int(np.max(rows[length:] - rows[:-length], initial=length)) for rows in valid_rows)
-
-
-def _whiten(values: np.ndarray, whitening: Sequence[float], lost: np.ndarray) -> np.ndarray:
-    if len(whitening) > LONG_FILTER:
-        return subtract_weighted_mean(values, whitening, lost)
-    filtered = values.copy() if len(whitening) > 1 else values
-    for lag, weight in enumerate(whitening[1:], 1):
-        filtered[..., lag:] += weight * values[..., :-lag]
-    return filtered

@@ -137,14 +137,14 @@ def _scan_delays(
     problem: ContactProblem, delays: np.ndarray, start: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Find, from `start`, the best surface position at each delay; return it, its std and log posterior."""
-    found = [find_best_surface(problem, delay, start, -np.inf) for delay in delays]
-    misfits = [inner.misfit - 2.0 * gain for _, inner, gain in found]
+    optima = [find_best_surface(problem, delay, start, -np.inf) for delay in delays]
+    misfits = [inner.misfit - 2.0 * gain for _, inner, gain in optima]
     best = min(misfits)
     for i in np.argsort(misfits) if has_steps(problem) else ():
-        found[i] = find_best_surface(problem, float(delays[i]), found[i][0], best + COARSE_GRID_DROP)
-        best = min(best, found[i][1].misfit - 2.0 * found[i][2])
+        optima[i] = find_best_surface(problem, float(delays[i]), optima[i][0], best + COARSE_GRID_DROP)
+        best = min(best, optima[i][1].misfit - 2.0 * optima[i][2])
     planes, stds, heights = [], [], []
-    for plane, inner, gain in found:
+    for plane, inner, gain in optima:
         stds.append(1.0 if problem.plane is not None else 1.0 / np.sqrt(max(inner.curvature, 1e-300)))
         planes.append(plane)
         heights.append(inner.evidence + gain + np.log(stds[-1]))

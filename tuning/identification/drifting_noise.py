@@ -71,6 +71,16 @@ def estimate_drifting_noise(readings: np.ndarray, period: float, stated: float) 
     return _fit_random_walk(readings, period, stated)[0]
 
 
+def whiten(values: np.ndarray, whitening: Sequence[float], lost: np.ndarray) -> np.ndarray:
+    """Apply a whitening filter of any length along the last axis; see `subtract_weighted_mean` for `lost`."""
+    if len(whitening) > LONG_FILTER:
+        return subtract_weighted_mean(values, whitening, lost)
+    filtered = values.copy() if len(whitening) > 1 else values
+    for lag, weight in enumerate(whitening[1:], 1):
+        filtered[..., lag:] += weight * values[..., :-lag]
+    return filtered
+
+
 def subtract_weighted_mean(
     values: np.ndarray, whitening: Sequence[float], lost: np.ndarray | None = None
 ) -> np.ndarray:

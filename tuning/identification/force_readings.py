@@ -80,6 +80,15 @@ class ForceReadings:
         return followed & ~self.is_valid
 
     @property
+    def filter_length(self) -> int:
+        """Return the largest number of rows that the whitening filter combines, with lost ones it skips."""
+        length = len(self.whitening)
+        if length <= LONG_FILTER:
+            return length
+        valid_rows = [np.flatnonzero(valid) for valid in self.is_valid.T]
+        return max(int(np.max(rows[length:] - rows[:-length], initial=length)) for rows in valid_rows)
+
+    @property
     def modes(self) -> FilterModes:
         """Return the modes of the prior's sensor filter or, without one, those of a first-order lag."""
         kind, order = (

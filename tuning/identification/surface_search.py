@@ -37,21 +37,23 @@ def find_best_surface(
         The best surface position [m]; the fit at this position or one small Newton step before it; and the
         increase of the log likelihood expected from this step (0 without such a step).
     """
-    found = _take_newton_steps(problem, delay, plane)
+    optimum = _take_newton_steps(problem, delay, plane)
     for _ in range(MAX_SCANS if has_steps(problem) else 0):
-        residuals = np.abs(problem.compute_edge_residuals(delay, found[0], found[1].coefficients))
-        if np.max(residuals, initial=0.0) < MIN_EDGE_RESIDUAL:
+        surface, fit, gain = optimum
+        residuals = np.abs(problem.compute_edge_residuals(delay, surface, fit.coefficients))
+        misfit = fit.misfit - 2.0 * gain
+        is_settled = np.max(residuals, initial=0.0) < MIN_EDGE_RESIDUAL
+        if is_settled or misfit - MAX_MISPLACED_ROWS * np.sum(residuals**2) > enough:
             break
-        misfit = found[1].misfit - 2.0 * found[2]
-        if misfit - MAX_MISPLACED_ROWS * np.sum(residuals**2) > enough:
+        planes = _list_adjacent_steps(problem, delay, surface)
+        if not len(planes):
             break
-        planes = _list_adjacent_steps(problem, delay, found[0])
-        fits = problem.fit_surfaces(delay, planes) if len(planes) else []
-        best = int(np.argmin([fit.misfit for fit in fits])) if fits else 0
-        if not fits or fits[best].misfit > misfit - MIN_SCAN_GAIN:
+        misfits = [scanned.misfit for scanned in problem.fit_surfaces(delay, planes)]
+        best = int(np.argmin(misfits))
+        if misfits[best] > misfit - MIN_SCAN_GAIN:
             break
-        found = _take_newton_steps(problem, delay, float(planes[best]))
-    return found
+        optimum = _take_newton_steps(problem, delay, float(planes[best]))
+    return optimum
 
 
 def has_steps(problem: ContactProblem) -> bool:
