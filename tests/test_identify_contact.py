@@ -232,3 +232,45 @@ def test_identify_finds_best_of_many_local_optima_of_stiff_damped_contact(monkey
         (result["rig.contact_plane"], 0.0),
     ):
         assert abs(estimate.value - true) < 3.5 * estimate.std
+
+
+@pytest.mark.parametrize("seed", (0, 4))
+def test_contact_posterior_finds_best_fit_if_force_jumps_by_400_times_the_noise(seed):
+    """Only a surface within some nanometres fits; it does not change linearly with the delay."""
+    quiet = problem("clean", kelvin_voigt(), noise=0.02, seed=seed)
+    posterior = compute_posterior(quiet)
+    rows = len(quiet.used_rows)
+    assert abs(posterior.best[2].misfit - rows) < 5.0 * np.sqrt(2.0 * rows)
+    deviations = posterior.mean[:4] - [0.0037, 0.0, 1.2e5, 650.0]
+    assert np.all(np.abs(deviations) < 4.0 * posterior.draws.std(axis=0)[:4])
+
+
+def test_contact_posterior_does_not_depend_on_an_approximate_delay(monkeypatch):
+    """A grid of delays that begins at the smallest possible delay has a shorter first step."""
+    rig = campaign_kinds.rig(force_sensor__delay=0.0019)
+    kind = campaign_kinds.Kind(rig, campaign_kinds.voigt(damping=(0.0,)))
+    monkeypatch.setitem(campaigns.KINDS, "undamped", kind)
+    undamped = problem("undamped", kelvin_voigt(), noise=0.02, seed=2)
+    undamped.min_delay = -0.0005
+    usual = compute_posterior(undamped)
+    near = compute_posterior(undamped, near=(0.001875, usual.best[1]))
+    np.testing.assert_allclose(near.mean[0], usual.mean[0], atol=0.1 * usual.draws[:, 0].std())
+
+
+@pytest.mark.parametrize("lag", (0.0, 0.0018))
+def test_contact_intervals_include_uncertainty_of_motion_simulator(monkeypatch, lag):
+    """Precise forces and imprecise positions: noise of the force alone gives scores of up to 27."""
+    rig = campaign_kinds.rig(noise=0.02, position_noise=5e-5, force_sensor__time_constant=lag)
+    monkeypatch.setitem(campaigns.KINDS, "imprecise", campaign_kinds.Kind(rig, campaign_kinds.voigt()))
+    scores = []
+    for seed in range(5):
+        campaign = campaigns.campaign("imprecise", seed, seconds=20.0)
+        result = identify(campaign, options=IdentificationOptions(law="kelvin_voigt", hold_out=0.0))
+        for key, true in (
+            ("delay and lag of force" if lag else "rig.force_sensor.delay", 0.0037 + lag),
+            ("contact.damping.0", 650.0),
+            ("contact.stiffness.0", 1.2e5),
+            ("rig.contact_plane", 0.0),
+        ):
+            scores.append((result[key].value - true) / result[key].std)
+    assert 0.6 < np.sqrt(np.mean(np.square(scores))) < 1.5

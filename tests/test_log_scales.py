@@ -208,6 +208,12 @@ def test_integrator_is_identified_from_rounded_log(quantum):
         assert detect_integrator(coarse, v, PERIOD) == name
 
 
+@pytest.mark.parametrize("rows", (3, 19))
+def test_integrator_of_short_rounded_log_is_unknown(rows):
+    v = 0.01 + 1e-4 * np.arange(rows)
+    assert detect_integrator(1e-3 * np.round(PERIOD * np.cumsum(v) / 1e-3), v, PERIOD) is None
+
+
 def test_scale_fit_has_stated_standard_error():
     random, off = np.random.default_rng(0), []
     unit = np.sin(np.arange(400) / 20.0)

@@ -62,6 +62,8 @@ class ContactFit:
     drift: ClockDrift | None = None  # drift of a separate force clock, whose offset is part of the delay
     has_specified_surface: bool = False  # whether the user specified the surface position
     resampled: str = ""  # summary of the bootstrap in words; empty without a bootstrap
+    # change of each posterior draw by the uncertainty of the motion simulator, shape (draws, parameters)
+    motion_shifts: np.ndarray | float = 0.0
 
     @property
     def readings(self) -> ForceReadings:
@@ -73,11 +75,18 @@ class ContactFit:
         return self.posterior.best[2].misfit / self.degrees_of_freedom
 
     def draws(self) -> np.ndarray:
-        """Return posterior draws, shape (draws, parameters), widened if the residuals exceed the noise."""
+        """Return draws of the parameters, shape (draws, parameters), with all uncertainties.
+
+        They include the uncertainty of the motion simulator, and are wider than the posterior if the
+        residuals exceed the noise.
+        """
         values = self.posterior.draws
-        if self.reduced_chi_square <= MAX_REDUCED_CHI_SQUARE or self.resampled:
-            return values
-        return values.mean(axis=0) + (values - values.mean(axis=0)) * np.sqrt(self.reduced_chi_square)
+        if self.reduced_chi_square > MAX_REDUCED_CHI_SQUARE and not self.resampled:
+            values = values.mean(axis=0) + (values - values.mean(axis=0)) * np.sqrt(self.reduced_chi_square)
+        values = np.asarray(values + self.motion_shifts)
+        positive = [2 + i for i in self.problem.damping_indices]
+        values[:, positive] = np.maximum(values[:, positive], 0.0)
+        return values
 
 
 def fit_contact(
@@ -353,27 +362,6 @@ def _estimate_noise_from_contact(
             result, counts=counts, std=float(std), threshold=float(std) if readings.threshold else 0.0
         )
     return result
-
-
-def estimate_contact_frequency(contact: ContactFit, mass: float) -> float:
-    """Return the contact frequency [Hz] of the stiffest contact, from its secant stiffness at full depth."""
-    delay, plane, coefficient_fit = contact.posterior.best
-    position, _ = contact.problem.motion.at(delay)
-    depth = np.where(contact.readings.counts, position - plane, 0.0)
-    force = np.where(
-        contact.readings.counts, contact.problem.force(delay, plane, coefficient_fit.coefficients), 0.0
-    )
-    deepest, lanes = np.argmax(depth, axis=0), np.arange(depth.shape[1])
-    peak = force[deepest, lanes]
-    # If the force of a contact is very small, noise dominates its secant stiffness.
-    secant = np.where(peak > 0.2 * peak.max(), peak / np.maximum(depth[deepest, lanes], 1e-9), 0.0)
-    return float(np.sqrt(max(secant.max(), 1e-9) / mass) / (2.0 * np.pi))
-
-
-def compute_force_lag(contact: ContactFit, model: MotionModel, frequency: float) -> float:
-    """Return the phase delay [s] from the command to the force reading at a frequency [Hz]."""
-    angle = float(np.angle(model.response(np.array([2j * np.pi * frequency]))[0]))
-    return contact.posterior.best[0] - angle / (2.0 * np.pi * frequency)
 
 
 def refit_without(fit: ContactFit, held_out: np.ndarray, seed: int = 0) -> ContactFit:

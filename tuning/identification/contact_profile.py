@@ -27,6 +27,9 @@ SMOOTHING_DELAYS = 7  # number of adjacent delays of the second grid whose surfa
 FINAL_GRID_DROP = 30.0  # twice the maximum drop of the log posterior from its peak in the final grid
 # Twice the maximum drop in the second grid; larger, because the coarse grid's log posterior is inaccurate.
 COARSE_GRID_DROP = 400.0
+# A search from delay to delay ends after several successive delays with a larger drop (twice that of the log
+# posterior).
+SEARCH_DROP, MAX_IMPROBABLE_DELAYS = 100.0, 3
 SECOND_GRID_SURFACES = 15  # number of surface positions at each delay of the second grid
 MAX_CELL_WIDTH_RATIO = 3.0  # maximum width of a cell, divided by the mean width
 MAX_CELL_EDGES = 1000  # maximum number of cell edges; an uncertain surface position would need more
@@ -100,6 +103,11 @@ def compute_posterior(
     low, high = _find_likely_delays(problem, delays, heights, COARSE_GRID_DROP)
     finer = np.linspace(low, high, int(np.clip((high - low) / FINE_DELAY_STEP, 21, 151)))
     surface = np.interp(finer, delays, planes), np.interp(finer, delays, stds)
+    if has_steps(problem):
+        followed, heights = _follow_surface(problem, finer, surface[0], float(delays[np.argmax(heights)]))
+        low, high = _find_likely_delays(problem, finer, heights, FINAL_GRID_DROP)
+        in_range = (finer >= low) & (finer <= high)
+        finer, surface = finer[in_range], (followed[in_range], surface[1][in_range])
     places, cells = _fit_grid(
         problem, finer, (surface[0], COARSE_STD_FACTOR * surface[1]), SECOND_GRID_SURFACES
     )
@@ -109,7 +117,10 @@ def compute_posterior(
     # If one cell contains the whole posterior at a delay, the estimated surface position jumps from delay to
     # delay: smooth it.
     planes = uniform_filter1d(planes, SMOOTHING_DELAYS, mode="nearest")
+    best = float(finer[np.argmax(heights)])
     surface = np.interp(delays, finer, planes), np.interp(delays, finer, np.maximum(spreads, surface[1]))
+    if has_steps(problem):
+        surface = _follow_surface(problem, delays, surface[0], best)[0], surface[1]
     places, cells = _fit_grid(problem, delays, surface, size[1])
     return _draw_from_grid(problem, places, cells, delays, seed)
 
@@ -151,16 +162,49 @@ def _scan_delays(
     return np.array(planes), np.array(stds), np.array(heights)
 
 
+def _follow_surface(
+    problem: ContactProblem, delays: np.ndarray, planes: np.ndarray, first: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the best surface position and the log posterior at each delay, from neighbour to neighbour.
+
+    Between delays, the best position does not change linearly, because the misfit is a staircase. Delays far
+    from the most probable one are omitted: their log posterior is minus infinity.
+
+    Args:
+        problem: Readings, motion and contact law.
+        delays: Delays [s], in ascending order.
+        planes: Approximate surface positions [m], one per delay.
+        first: Delay [s] at which the search begins; it proceeds to both sides.
+    """
+    planes, begin = planes.copy(), int(np.argmin(np.abs(delays - first)))
+    least, heights = np.inf, np.full(len(delays), -np.inf)
+    for order in (range(begin, len(delays)), range(begin - 1, -1, -1)):
+        plane, improbable = planes[begin], 0
+        for i in order:
+            plane, inner, gain = find_best_surface(
+                problem, float(delays[i]), float(plane), least + FINAL_GRID_DROP
+            )
+            least = min(least, inner.misfit - 2.0 * gain)
+            planes[i], heights[i] = plane, inner.evidence + gain
+            improbable = improbable + 1 if 2.0 * (heights.max() - heights[i]) > SEARCH_DROP else 0
+            if improbable == MAX_IMPROBABLE_DELAYS:
+                break
+    return planes, heights
+
+
 def _find_likely_delays(
     problem: ContactProblem, delays: np.ndarray, heights: np.ndarray, reach: float
 ) -> tuple[float, float]:
     """Return the range of delays [s] in which the log posterior `heights` is close to its maximum.
 
-    Twice the drop from the maximum is at most `reach` there. One step is added on each side.
+    Twice the drop from the maximum is at most `reach` there. One step is added on each side; the first and
+    the last step of a clipped grid may be shorter than the others.
     """
     inside = np.flatnonzero(2.0 * (heights.max() - heights) <= reach)
-    step = delays[1] - delays[0]
-    return max(problem.min_delay, delays[inside[0]] - step), min(MAX_FORCE_DELAY, delays[inside[-1]] + step)
+    ends = 2.0 * delays[0] - delays[1], 2.0 * delays[-1] - delays[-2]
+    wider = np.concatenate([ends[:1], delays, ends[1:]])
+    low, high = float(wider[inside[0]]), float(wider[inside[-1] + 2])
+    return max(problem.min_delay, low), min(MAX_FORCE_DELAY, high)
 
 
 def _fit_grid(

@@ -18,12 +18,14 @@ from tuning.identification import conditioning, free_motion, mechanism_models, p
 from tuning.identification import contact_fit as contacts
 from tuning.identification.bootstrap import bootstrap
 from tuning.identification.contact_fit import ContactFit
+from tuning.identification.contact_frequency import estimate_contact_frequency
 from tuning.identification.contact_profile import POSTERIOR_DRAWS
 from tuning.identification.contact_runs import exclude_rows_after_gaps, split_long_run
 from tuning.identification.drifting_noise import estimate_force_noise
 from tuning.identification.estimates import estimate_combinations, get_unit, make_estimates
 from tuning.identification.free_motion import FreeMotion
 from tuning.identification.identified_mechanism import compute_bound_excess, make_mechanism
+from tuning.identification.motion_uncertainty import add_motion_uncertainty
 from tuning.identification.noise import NoiseEstimate, estimate_noise, recognise_noise_free_readings
 from tuning.identification.notes import collect_notes, note_absent_dead_zone
 from tuning.identification.options import KEYS_FIXED_BEFORE_FIT, IdentificationOptions, check_options
@@ -35,7 +37,6 @@ from tuning.identification.result_checks import check_result
 from tuning.identification.structure_choice import MAX_RELATIVE_STD
 
 MIN_REST_ROWS = 200  # minimum number of rows at rest for an estimate of the noise
-ASSUMED_CONTACT_FREQUENCY = 3.0  # contact frequency that is assumed if the logs have no contact [Hz]
 STAGE_COUNT = 3  # number of progress messages without a bootstrap, which adds one per chunk of fits
 ReportProgress = Callable[[str], None]  # receives the name of each stage when it begins
 FORCE_DELAY_KEY, DEAD_ZONE_KEY = "rig.force_sensor.delay", "rig.force_sensor.dead_zone"
@@ -83,10 +84,11 @@ def identify(
     if force is not None and not sensor.dead_zone:
         force = recognise_noise_free_readings(force, [run.valid_forces for run in touching])
     contact, left_out = _fit_and_check_contact(touching, model, campaign, force, sensor, options, say)
-    frequency = _estimate_frequency(contact, campaign.equivalent_mass)
+    contact, deviations = add_motion_uncertainty(contact, touching, motion, campaign.timing, options.seed)
+    frequency = estimate_contact_frequency(contact, campaign.equivalent_mass)
     clock_drift = None if contact is None else contact.drift
     share = _choose_position_delay(motion, None if clock_drift else contact, prior, options)
-    draws = _draw_parameters(motion, contact, model, frequency, share, options.seed)
+    draws = _draw_parameters(motion, contact, deviations, frequency, share)
     used_keys = KEYS_FIXED_BEFORE_FIT if clock_drift is None else (*KEYS_FIXED_BEFORE_FIT, FORCE_DELAY_KEY)
     draws, conditioned, contradictions = _condition_draws(draws, used_keys, frequency, prior, options)
     fixed = {**_select_fixed_before_fit(used_keys, share, prior, options), **conditioned}
@@ -133,13 +135,6 @@ def _select_runs_in_contact(campaign: Campaign, model: MotionModel) -> list[Logg
     period = campaign.timing.control_period
     runs = exclude_rows_after_gaps([run for run in campaign.runs if run.kind in CONTACT_KINDS], model, period)
     return [segment for run in runs for segment in split_long_run(run, period)]
-
-
-def _estimate_frequency(contact: ContactFit | None, mass: float) -> float:
-    """Return the contact frequency [Hz]; without contacts in the logs, return an assumed value."""
-    return (
-        ASSUMED_CONTACT_FREQUENCY if contact is None else contacts.estimate_contact_frequency(contact, mass)
-    )
 
 
 def _condition_draws(
@@ -309,35 +304,25 @@ def select_held_out_contacts(runs: Sequence[LoggedRun], share: float) -> np.ndar
 def _draw_parameters(
     motion: FreeMotion | None,
     contact: ContactFit | None,
-    model: MotionModel | None,
+    deviations: np.ndarray | None,
     frequency: float,
     share: float,
-    seed: int,
 ) -> dict[str, np.ndarray]:
     """Return posterior draws of all parameters by key, in SI units.
 
     Args:
         motion: Fit of the motion simulator, or None.
         contact: Fit of the contact, or None.
-        model: Model of the motion simulator, or None.
+        deviations: Deviations of the draws from the parameters of the motion simulator, or None.
         frequency: Contact frequency [Hz].
         share: Delay of the position sensor [s], moved from the fitted motion delay to the force delay.
-        seed: Seed of the random numbers.
     """
-    result, lag = {}, np.zeros(POSTERIOR_DRAWS)
-    if motion is not None and model is not None:
-        rng = np.random.default_rng([seed, 1])
-        result, lag = parameters.draw_simulator_parameters(
-            model, motion.covariance, frequency, POSTERIOR_DRAWS, rng
-        )
-    if contact is not None:
-        # The fit determines the sum of the motion's lag and the force delay, so their errors have opposite
-        # signs.
-        result |= parameters.convert_contact_draws(contact)
-        result[FORCE_DELAY_KEY] = result[FORCE_DELAY_KEY] - lag
-    if motion is not None:
+    result = {}
+    if motion is not None and deviations is not None:
+        result = parameters.draw_simulator_parameters(motion.model, deviations, frequency)
         result["rig.simulator.delay"] = result["rig.simulator.delay"] - share
     if contact is not None:
+        result |= parameters.convert_contact_draws(contact)
         result[FORCE_DELAY_KEY] = result[FORCE_DELAY_KEY] + share
         if contact.drift is not None:
             # The unknown offset between two clocks adds to the force delay, so the logs do not determine it.

@@ -14,6 +14,7 @@ from jaxhil.mechanism.uncertainty import draw
 from tuning.identification import clock_drift, free_motion, mechanism_models, validation
 from tuning.identification import contact_fit as contacts
 from tuning.identification.contact_fit import ContactFit
+from tuning.identification.contact_frequency import compute_force_lag, estimate_contact_frequency
 from tuning.identification.contact_problem import MAX_FORCE_DELAY, ContactProblem
 from tuning.identification.contact_profile import Posterior
 from tuning.identification.contact_regression import CoefficientFit
@@ -39,7 +40,6 @@ from tuning.identification.uncertainty_effect import UncertaintyEffect, compute_
 from tuning.identification.unmodelled_effects import check_modelled_effects
 
 MIN_DELAY_STD = 2e-5  # minimum standard deviation of a delay [s]
-ASSUMED_CONTACT_FREQUENCY = 3.0  # contact frequency that is assumed if the logs have no contact [Hz]
 
 
 def check_against_mechanism(
@@ -76,9 +76,7 @@ def check_against_mechanism(
         contact = _make_contact_fit(touching, model, campaign, mechanism)
     elif motion is None:
         raise InputError("logs: found neither free motion nor contact, expected runs of either kind")
-    frequency = (
-        ASSUMED_CONTACT_FREQUENCY if contact is None else contacts.estimate_contact_frequency(contact, mass)
-    )
+    frequency = estimate_contact_frequency(contact, mass)
     lines = check_modelled_effects(mechanism)
     if motion is not None:
         structures = mechanism_models.list_structures(mechanism)
@@ -90,7 +88,7 @@ def check_against_mechanism(
             validation.check_delay_sign(fitted, frequency),
         ]
     if contact is not None:
-        lag = contacts.compute_force_lag(contact, model, frequency)
+        lag = compute_force_lag(contact, model, frequency)
         flags = np.ones(len(touching), bool)
         lines += validation.check_contact_model(contact, touching, mass, frequency, lag, flags)
         lines += check_motion_in_contact(contact, touching, frequency)

@@ -10,7 +10,6 @@ from jaxhil.contact.laws import CONTACT_KEYS, find_contact_law
 from tuning.identification.contact_fit import SPECIFIED_DEAD_ZONE_STD, ContactFit
 from tuning.identification.contact_laws import Law
 from tuning.identification.cut_zone import draw_zone
-from tuning.identification.normal_draws import factorise_covariance
 from tuning.identification.rational import MotionModel
 
 SIMULATOR_PREFIX, CUTOFF_KEY = "rig.simulator.", "rig.force_sensor.filter.cutoff"
@@ -47,9 +46,9 @@ def make_simulator_section(model: MotionModel) -> dict[str, Any]:
 
 
 def draw_simulator_parameters(
-    model: MotionModel, covariance: np.ndarray, frequency: float, count: int, rng
-) -> tuple[dict[str, np.ndarray], np.ndarray]:
-    """Draw the parameters of the motion simulator from a normal distribution.
+    model: MotionModel, deviations: np.ndarray, frequency: float
+) -> dict[str, np.ndarray]:
+    """Return draws of the motion simulator's parameters by key.
 
     For a moving average or a first- or second-order model, the draws contain all parameters. For any other
     model, they contain only the delay: the fitted delay plus the deviation of the phase delay at the contact
@@ -57,32 +56,25 @@ def draw_simulator_parameters(
 
     Args:
         model: Fitted model.
-        covariance: Covariance of the model's parameters.
+        deviations: Deviations of the draws from the model's parameters, shape (draws, parameters).
         frequency: Contact frequency [Hz].
-        count: Number of draws.
-        rng: Random number generator.
-
-    Returns:
-        Draws by key, and each draw's deviation of the phase delay at the contact frequency [s].
     """
-    deviations = rng.standard_normal((count, len(covariance))) @ factorise_covariance(covariance).T
-    s = np.array([2j * np.pi * frequency])
-    slopes = -np.imag(model.slopes(s)[:, 0]) / (2.0 * np.pi * frequency)
-    lag = deviations @ slopes
     values = model.parameters + deviations
     name = model.structure.name
     if name in ("first_order", "moving_average"):
         return {
             SIMULATOR_PREFIX + model.names[0]: np.exp(values[:, 0]),
             SIMULATOR_PREFIX + "delay": values[:, 1],
-        }, lag
+        }
     if name == "second_order":
         return {
             SIMULATOR_PREFIX + "natural_frequency": np.exp(values[:, 0]) / (2.0 * np.pi),
             SIMULATOR_PREFIX + "damping_ratio": np.exp(values[:, 1]),
             SIMULATOR_PREFIX + "delay": values[:, 2],
-        }, lag
-    return {SIMULATOR_PREFIX + "delay": model.delay + lag}, lag
+        }
+    s = np.array([2j * np.pi * frequency])
+    slopes = -np.imag(model.slopes(s)[:, 0]) / (2.0 * np.pi * frequency)
+    return {SIMULATOR_PREFIX + "delay": model.delay + deviations @ slopes}
 
 
 def convert_contact_draws(contact: ContactFit) -> dict[str, np.ndarray]:

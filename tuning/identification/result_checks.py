@@ -10,8 +10,9 @@ import numpy as np
 from jaxhil.errors import InputError
 from jaxhil.mechanism.file import from_plain_data
 from jaxhil.mechanism.structs import Mechanism
-from tuning.identification import contact_fit, validation
+from tuning.identification import validation
 from tuning.identification.contact_fit import ContactFit
+from tuning.identification.contact_frequency import compute_force_lag
 from tuning.identification.dead_zone_check import check_cut_dead_zone
 from tuning.identification.free_motion import FreeMotion
 from tuning.identification.mechanism_check import check_against_mechanism, check_file_uncertainty
@@ -101,7 +102,7 @@ def _check_fits(
             validation.check_delay_sign(motion, frequency),
         ]
     if contact is not None and model is not None:
-        lag = contact_fit.compute_force_lag(contact, model, frequency)
+        lag = compute_force_lag(contact, model, frequency)
         all_touches = np.ones(len(touching), bool)
         lines += [
             validation.check_stiffness_sign(contact),

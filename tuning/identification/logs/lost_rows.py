@@ -93,6 +93,8 @@ def _detect_integrator_over_span(x: np.ndarray, v: np.ndarray, period: float) ->
 
     In each period, an integrator uses the velocity at the start, the velocity at the end, or their mean.
     """
+    if len(v) <= INTEGRATOR_SPAN_ROWS:
+        return None
     finite = np.isfinite(v)
     summed = np.cumsum(np.where(finite, v, 0.0))
     complete = np.convolve(~finite, np.ones(INTEGRATOR_SPAN_ROWS + 1, int), "valid") == 0
