@@ -94,3 +94,10 @@ def test_contact_of_small_force_is_detected_in_noise(peak):
     contacts = detect_contacts(force, 0.001)
     assert len(contacts) == (peak > 0.0)
     assert all(abs(first - 100) < 30 and abs(last - 220) < 30 for first, last in contacts)
+
+
+def test_weak_contact_near_the_beginning_of_a_short_log_is_detected():
+    force = 2.7 * np.random.default_rng(4).standard_normal(273)
+    force[65:120] += 35.0 * np.sin(np.linspace(0.0, np.pi, 55))
+    ((first, last),) = detect_contacts(force, 0.004)
+    assert abs(first - 65) < 12 and abs(last - 120) < 12

@@ -197,3 +197,15 @@ def test_logged_contact_requires_force_and_free_run_requires_no_force(tmp_path):
     assert run.force_measured is None and run.contact_index is None and run.kind == "free"
     with pytest.raises(InputError, match="force_measured: found no such channel"):
         read(path)
+
+
+def test_log_without_contact_is_omitted_if_other_logs_have_contacts(tmp_path):
+    weak = touches(1)
+    weak["F"] = 0.3 * np.random.default_rng(0).standard_normal(len(weak["F"]))
+    weak["Fc"] = 0.0 * weak["F"]
+    paths = [write_csv(tmp_path / "a.csv", LOG), write_csv(tmp_path / "b.csv", weak)]
+    campaign = read_campaign(paths, mapping(force_command=None))
+    assert [run.source for run in campaign.runs] == ["a.csv", "a.csv"]
+    assert campaign.notes == (f"{paths[1]}: 600 rows without contact are omitted",)
+    with pytest.raises(InputError, match=r"b\.csv: found no run in 600 rows, expected at least 50 success"):
+        read_campaign(paths[1:], mapping(force_command=None))

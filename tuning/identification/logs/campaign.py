@@ -49,8 +49,9 @@ def read_campaign(
     """Read all runs of a campaign from log files and check them.
 
     The runs have the order of the `[[runs]]` entries in the mapping and, within an entry, the order of the
-    files. Without a mapping, the columns must have the names of `jaxhil simulate --log`, and every file must
-    contain contacts. If the mapping omits the timing or the mass, the prior provides them.
+    files. A file without a run is omitted, with a note, if another file of the entry has runs. Without a
+    mapping, the columns must have the names of `jaxhil simulate --log`, and the files must contain contacts.
+    If the mapping omits the timing or the mass, the prior provides them.
 
     Args:
         logs: Paths of the log files.
@@ -77,13 +78,14 @@ def read_campaign(
     notes: dict[str, list[str]] = {}  # for each note, the names of the logs that it concerns
     clocks = []
     for entry in mapping.runs:
-        for path in logs:
-            if entry.names(path):
-                reading = _RunsOfFile(path, entry, mapping, timing, mass, prior)
-                runs += reading.runs
-                for note in reading.notes:
-                    notes.setdefault(note.removeprefix(f"{reading.label}: "), []).append(reading.label)
-                clocks.append(reading.ticks.clock)
+        paths = [path for path in logs if entry.names(path)]
+        readings = [_RunsOfFile(path, entry, mapping, timing, mass, prior) for path in paths]
+        _check_runs(readings)
+        for reading in readings:
+            runs += reading.runs
+            for note in reading.notes:
+                notes.setdefault(note.removeprefix(f"{reading.label}: "), []).append(reading.label)
+            clocks.append(reading.ticks.clock)
     integrator = detect_common_integrator(runs, timing.control_period) or (prior and prior.rig.integrator)
     if not timing.two_clocks:
         check_row_convention(runs, timing, integrator)
@@ -100,6 +102,17 @@ def check_names(logs: Sequence[Path], entries: Sequence[RunFiles]) -> None:
             raise InputError(
                 f"{to_one_line(str(path))}: found a name that no [[runs]] entry matches, expected {patterns}"
             )
+
+
+def _check_runs(readings: Sequence[_RunsOfFile]) -> None:
+    """Raise `InputError` if none of the files of a `[[runs]]` entry has a run."""
+    if readings and not any(reading.runs for reading in readings):
+        first, more = readings[0], len(readings) - 1
+        raise InputError(
+            f"{first.label}{f' and {more} more' * (more > 0)}: found no run in {len(first.ticks.tick)} rows, "
+            f"expected at least {MIN_SEGMENT_ROWS} successive rows; for the kinds contact and tap, with a "
+            "contact"
+        )
 
 
 def _merge_notes(notes: Mapping[str, Sequence[str]]) -> tuple[str, ...]:
@@ -180,11 +193,6 @@ class _RunsOfFile:
         runs: list[LoggedRun] = []
         for kind, segment in segments:
             runs += self._make_runs(segment, kind, segment is longest[kind])
-        if not runs:
-            expected = (
-                f"at least {MIN_SEGMENT_ROWS} successive rows; for the kinds contact and tap, with a contact"
-            )
-            raise InputError(f"{self.label}: found no run in {len(tick)} rows, expected {expected}")
         return runs
 
     def _make_runs(self, segment: LogSegment, kind: RunKind, has_motion: bool) -> list[LoggedRun]:

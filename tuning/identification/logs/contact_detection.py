@@ -34,7 +34,7 @@ def detect_contacts(
     if rest is None and is_weak:
         mean = _average_readings(force)
         # Means of disjoint groups of readings determine the threshold; overlapping means are correlated.
-        size, threshold = np.abs(mean - level), estimate_contact_threshold(mean[::AVERAGED_ROWS])
+        size, threshold = np.abs(mean - level), estimate_contact_threshold(mean, AVERAGED_ROWS)
     is_above = size > threshold
     is_sustained = is_above.copy()
     for ticks in range(1, MIN_CONTACT_TICKS):
@@ -57,12 +57,11 @@ def estimate_resting_force(force: np.ndarray) -> float:
     return float(np.nanmedian(_select_first_readings(force)))
 
 
-def estimate_contact_threshold(force: np.ndarray) -> float:
-    """Return the force [N] above which contact is assumed, from the noise of the readings."""
-    steps = np.diff(force[np.isfinite(force)])
-    sigma = max(
-        1.4826 * float(np.median(np.abs(steps))) / np.sqrt(2), float(np.nanstd(_select_first_readings(force)))
-    )
+def estimate_contact_threshold(force: np.ndarray, step: int = 1) -> float:
+    """Return the force [N] above which contact is assumed, from the noise of every `step`-th reading."""
+    first, readings = _select_first_readings(force)[::step], force[::step]
+    steps = np.diff(readings[np.isfinite(readings)])
+    sigma = max(1.4826 * float(np.median(np.abs(steps))) / np.sqrt(2), float(np.nanstd(first)))
     return max(CONTACT_THRESHOLD_SIGMAS * sigma, 1e-6 * float(np.nanmax(np.abs(force))))
 
 
