@@ -4,6 +4,7 @@ from dataclasses import replace
 from typing import Any
 
 import ambiguous_campaigns as ambiguous
+import campaign_kinds
 import campaigns
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from scipy.signal import butter, lfilter
 
 from jaxhil.mechanism.file import from_plain_data, to_plain_data
 from tuning.identification.edge_check import check_force_smoothing
-from tuning.identification.identify import identify
+from tuning.identification.identify import IdentificationOptions, identify
 from tuning.identification.mechanism_check import check_against_mechanism
 from tuning.identification.motion import MotionResponse
 from tuning.identification.noise import estimate_noise
@@ -73,11 +74,43 @@ def test_filter_that_explains_logs_with_another_damping_adds_to_the_effect(monke
 def test_dead_zone_is_estimated_from_noise_at_rest():
     signal = np.random.default_rng(1).standard_normal(20_000)
     noise = estimate_noise(np.sign(signal) * np.maximum(np.abs(signal) - 0.7, 0.0))
-    assert noise.silent and noise.dead_zone is not None
-    value, std = noise.dead_zone
+    assert noise.silent and noise.hidden is not None
+    value, std = noise.hidden.zone, np.sqrt(noise.hidden.covariance[1, 1])
     assert abs(value - 0.7) < 4.0 * std < 0.1 and noise.std == pytest.approx(1.0, rel=0.05)
     cut = estimate_noise(np.where(np.abs(signal) > 0.7, signal, 0.0))
-    assert cut.silent and cut.dead_zone is None
+    assert cut.silent and cut.hidden is None
+
+
+@pytest.mark.parametrize(("bias", "zone", "pole"), [(-0.27, 0.57, 0.0), (0.3, 0.4, 0.0), (0.1, 0.5, 0.9)])
+def test_bias_behind_dead_zone_is_estimated_with_its_stated_error(bias, zone, pole):
+    scores = []
+    for seed in range(20):
+        noise = np.random.default_rng(seed).standard_normal(8000)
+        if pole:
+            noise = lfilter([np.sqrt(1.0 - pole**2)], [1.0, -pole], noise)
+        signal = bias + 0.34 * noise
+        hidden = estimate_noise(np.sign(signal) * np.maximum(np.abs(signal) - zone, 0.0)).hidden
+        assert hidden is not None
+        missing, std = hidden.missing_force
+        errors = hidden.bias - bias, hidden.zone - zone, missing - zone + bias
+        scores.append(np.array(errors) / [*np.sqrt(np.diag(hidden.covariance)), std])
+    assert np.all(np.sqrt(np.mean(np.square(scores), axis=0)) < 1.5)
+
+
+def test_identify_separates_dead_zone_from_bias(monkeypatch):
+    """A zone that hides only a part of the noise: half of the readings at rest are 0."""
+    sensor = {"force_sensor__dead_zone": 0.57, "force_sensor__bias": -0.27, "force_sensor__delay": 0.0037}
+    rig = campaign_kinds.rig(noise=0.34, **sensor)
+    monkeypatch.setitem(campaigns.KINDS, "zone", campaign_kinds.Kind(rig, campaign_kinds.voigt()))
+    result = identify(campaigns.campaign("zone", 0), options=IdentificationOptions(law="kelvin_voigt"))
+    for key, true in (
+        ("rig.force_sensor.dead_zone", 0.57),
+        ("rig.force_sensor.bias", -0.27),
+        ("rig.force_sensor.delay", 0.0037),
+        ("contact.damping.0", 650.0),
+        ("rig.contact_plane", 0.0),
+    ):
+        assert abs(result[key].value - true) < 3.5 * result[key].std
 
 
 DATA_FINDING = "no reading lies between 0 and 3 N, as with a dead zone that is not subtracted"

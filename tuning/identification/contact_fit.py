@@ -23,6 +23,7 @@ from tuning.identification.contact_profile import Posterior, compute_posterior
 from tuning.identification.cut_zone import estimate_hidden_bias, find_largest_size
 from tuning.identification.deep_contact import summarise_deep_lanes
 from tuning.identification.force_readings import ForceReadings
+from tuning.identification.hidden_noise import HiddenNoise
 from tuning.identification.law_choice import EvaluatedLaw, choose_contact_law, search_coarsely
 from tuning.identification.motion import MotionResponse
 from tuning.identification.noise import MIN_ZERO_SHARE, NoiseEstimate
@@ -58,7 +59,9 @@ class ContactFit:
     posterior: Posterior
     degrees_of_freedom: int  # degrees of freedom: number of readings minus number of parameters
     noise_error: float  # relative standard error of the noise level that weights the residuals
-    dead_zone: bool  # whether the sensor has a dead zone; the parameter "bias" is then minus the dead zone
+    # whether the sensor has a dead zone; the parameter "bias" is then the bias minus the dead zone
+    dead_zone: bool
+    hidden_noise: HiddenNoise | None = None  # noise, bias and dead zone at rest, if a dead zone hides them
     drift: ClockDrift | None = None  # drift of a separate force clock, whose offset is part of the delay
     has_specified_surface: bool = False  # whether the user specified the surface position
     resampled: str = ""  # summary of the bootstrap in words; empty without a bootstrap
@@ -149,6 +152,7 @@ def fit_contact(
         degrees_of_freedom,
         error,
         bool(noise_is_hidden),
+        None if noise is None else noise.hidden,
         drift,
         is_specified,
     )
@@ -168,10 +172,10 @@ def _prepare_readings(
     prior, noise_is_hidden = None, noise is not None and noise.silent
     zone = sensor.dead_zone
     cut = find_largest_size(runs) if noise_is_hidden and zone and sensor.dead_zone_kind == "cut" else 0.0
-    if noise is not None and noise_is_hidden:
-        prior = noise.dead_zone
+    if noise is not None and noise_is_hidden and noise.hidden is not None:
+        prior = noise.hidden.missing_force
     if noise_is_hidden and zone and not cut:
-        hidden, std = estimate_hidden_bias(runs, zone, zone)
+        hidden, std = estimate_hidden_bias(runs, zone, True)
         prior = zone - hidden, float(np.hypot(std, SPECIFIED_DEAD_ZONE_STD * zone))
     low_pass = None if noise_is_hidden else sensor.filter
     if noise is None or noise_is_hidden or noise.std == 0.0:

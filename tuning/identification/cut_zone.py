@@ -10,11 +10,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from scipy import optimize, special
 
+from tuning.identification import hidden_noise
 from tuning.identification.contact_problem import ContactProblem
 from tuning.identification.contact_profile import POSTERIOR_DRAWS, Posterior
-from tuning.identification.noise import MIN_READINGS_BEYOND_DEAD_ZONE, detect_quantum
+from tuning.identification.noise import detect_quantum
 from tuning.identification.records import LoggedRun
 
 ZONE_GRID_SIZE = 400  # number of zone sizes that are tried, from 0 to the smallest reading
@@ -34,7 +34,7 @@ def find_largest_size(runs: Sequence[LoggedRun]) -> float:
 
 
 def estimate_hidden_bias(
-    runs: Sequence[LoggedRun], zone: float, subtracted: float = 0.0
+    runs: Sequence[LoggedRun], zone: float, is_subtracted: bool = False
 ) -> tuple[float, float]:
     """Estimate the bias of the readings before contact although a dead zone replaces most of them by 0.
 
@@ -43,29 +43,14 @@ def estimate_hidden_bias(
     Args:
         runs: Runs that begin before contact.
         zone: Size of the zone [N].
-        subtracted: Force that the zone subtracts from larger forces [N]; 0 if it keeps larger forces.
+        is_subtracted: Whether the sensor subtracts the zone from larger forces.
 
     Returns:
         Mean and standard deviation of the bias [N]; assumed values if too few readings exceed the zone.
     """
     before = np.concatenate([_take_readings_before_contact(run) for run in runs])
-    values = before[before != 0.0]
-    if len(values) < MIN_READINGS_BEYOND_DEAD_ZONE:
-        return 0.0, ASSUMED_BIAS_SHARE * zone
-    values = values + subtracted * np.sign(values)
-
-    def cost(parameters):
-        bias, std = parameters[0], np.exp(parameters[1])
-        inside = _log_probability_of_zero(bias, std, zone)
-        left = 0.5 * np.sum(((values - bias) / std) ** 2) + len(values) * np.log(std)
-        return float(left - (len(before) - len(values)) * inside)
-
-    start = [0.0, np.log(0.5 * float(np.abs(values).mean()))]
-    optimum = optimize.minimize(cost, start, method="Nelder-Mead", options={"xatol": 1e-6, "fatol": 1e-8})
-    step = 0.01 * np.exp(optimum.x[1])
-    shift = np.array([step, 0.0])
-    rise = cost(optimum.x + shift) + cost(optimum.x - shift) - 2.0 * optimum.fun
-    return float(optimum.x[0]), float(step / np.sqrt(max(rise, 1e-12)))
+    estimate = hidden_noise.estimate_hidden_bias(before, zone, is_subtracted)
+    return (0.0, ASSUMED_BIAS_SHARE * zone) if estimate is None else estimate
 
 
 def draw_zone(problem: ContactProblem, posterior: Posterior, seed: int = 0) -> np.ndarray:
@@ -84,18 +69,16 @@ def draw_zone(problem: ContactProblem, posterior: Posterior, seed: int = 0) -> n
         predicted = problem.force(draw[0], draw[1], draw[2 : 2 + count])[is_zero]
         # Forces far inside the zone do not bound its size.
         predicted = predicted[predicted > 0.0]
-        heights.append([_log_probability_of_zero(predicted, readings.std, size).sum() for size in sizes])
+        heights.append(
+            [
+                hidden_noise.compute_log_probability_of_zero(predicted, readings.std, size).sum()
+                for size in sizes
+            ]
+        )
     # The readings of 0 also select the draws of the contact that agree with them.
     share = np.cumsum(np.exp(np.array(heights) - np.max(heights)).sum(axis=0))
     uniform = np.random.default_rng([seed, 5]).uniform(size=POSTERIOR_DRAWS)
     return np.interp(uniform, np.append(0.0, share / share[-1]), np.append(0.0, sizes))
-
-
-def _log_probability_of_zero(force, std: float, zone: float):
-    """Return the log probability that a force [N] with noise lies inside the dead zone and so reads 0."""
-    force = np.abs(force)
-    high, low = special.log_ndtr((zone - force) / std), special.log_ndtr((-zone - force) / std)
-    return high + np.log1p(-np.exp(np.minimum(low - high, -1e-15)))
 
 
 def _take_readings_before_contact(run: LoggedRun) -> np.ndarray:

@@ -16,12 +16,11 @@ import numpy as np
 from scipy import linalg, optimize, special
 from scipy.signal import lfilter
 
+from tuning.identification.hidden_noise import HiddenNoise, estimate_hidden_noise
+
 MAX_AUTOREGRESSION_ORDER = 8  # maximum order of the autoregression
-MIN_READINGS_BEYOND_DEAD_ZONE = 20  # minimum number of nonzero readings to estimate a dead zone
 MAX_DISTINCT_SHARE = 0.2  # maximum number of distinct values per reading in rounded readings
 MIN_EXCESS_ZERO_SHARE = 0.02  # minimum share of exact zeros, beyond those from rounding, for a dead zone
-# Maximum ratio of smallest to mean magnitude of nonzero readings with a dead zone that is subtracted.
-MAX_LEAST_TO_MEAN_RATIO = 0.3
 # Maximum scatter of readings in contact that shows no noise, divided by the scatter from rounding, and by the
 # largest reading.
 MAX_ROUNDING_RATIO, MAX_SCATTER_SHARE = 2.0, 1e-4
@@ -42,7 +41,7 @@ class NoiseEstimate:
     filter: tuple[float, ...]  # coefficients of the whitening filter; the first one is 1
     number: int  # number of readings
     drift: float = 0.0  # change from the first to the last reading; 0 if it is smaller than the noise
-    dead_zone: tuple[float, float] | None = None  # dead zone for a bias of 0, and its standard error
+    hidden: HiddenNoise | None = None  # noise, bias and dead zone, if a dead zone hides the noise
     # random walk of the bias, per sqrt(s), and its standard error; None if the bias is assumed to be constant
     walk: tuple[float, float] | None = None
     bias_step: float = 0.0  # standard deviation of the change of the bias between two readings
@@ -66,8 +65,9 @@ def estimate_noise(readings: np.ndarray) -> NoiseEstimate:
     quantum = detect_quantum(readings)
     number = len(readings)
     if _has_excess_zeros(readings, quantum):
-        std, dead_zone = _fit_dead_zone(readings)
-        return NoiseEstimate(0.0, std, np.inf, np.inf, quantum, True, (1.0,), number, 0.0, dead_zone)
+        hidden = estimate_hidden_noise(readings)
+        std = 0.0 if hidden is None else hidden.std
+        return NoiseEstimate(0.0, std, np.inf, np.inf, quantum, True, (1.0,), number, 0.0, hidden)
     if np.ptp(readings) == 0.0:
         return NoiseEstimate(float(readings[0]), 0.0, 0.0, 0.0, quantum, False, (1.0,), number)
     drift = _estimate_drift(readings)
@@ -128,42 +128,6 @@ def _has_excess_zeros(readings: np.ndarray, quantum: float) -> bool:
     size = float(np.sqrt(np.mean(readings[~zero] ** 2))) if not zero.all() else 0.0
     # Rounding changes at most a share of 0.4 quantum / std of the readings to 0.
     return size > 0.0 and float(np.mean(zero)) > MIN_EXCESS_ZERO_SHARE + quantum / size
-
-
-def _fit_dead_zone(readings: np.ndarray) -> tuple[float, tuple[float, float] | None]:
-    """Estimate the noise and the dead zone of a sensor from readings at rest, assuming a bias of 0.
-
-    For a normally distributed signal n, the sensor is assumed to read sign(n) max(|n| - D, 0). The dead zone
-    D and the standard deviation of n are maximum likelihood estimates.
-
-    Returns:
-        The standard deviation, and the dead zone with its standard error. The result is 0 and None if too few
-        readings differ from 0, or if a gap around 0 shows that the sensor does not subtract the dead zone.
-    """
-    size = np.abs(readings[readings != 0.0])
-    zeros, number = len(readings) - len(size), len(size)
-    if number < MIN_READINGS_BEYOND_DEAD_ZONE or size.min() > MAX_LEAST_TO_MEAN_RATIO * size.mean():
-        return 0.0, None
-
-    def cost(parameters):
-        dead_zone, std = np.exp(parameters)
-        log_tail = special.log_ndtr(-dead_zone / std)
-        inside = np.log(-np.expm1(np.log(2.0) + log_tail)) if log_tail < -np.log(2.0) else -np.inf
-        return -zeros * inside + 0.5 * np.sum(((size + dead_zone) / std) ** 2) + number * np.log(std)
-
-    start = np.log([size.mean(), 2.0 * size.mean()])
-    optimum = optimize.minimize(cost, start, method="Nelder-Mead", options={"xatol": 1e-6, "fatol": 1e-8})
-    dead_zone, std = np.exp(optimum.x)
-    # Central differences give the curvature of the likelihood.
-    step = 1e-3
-    shifts = step * np.array([[1, 1], [1, -1], [-1, 1], [-1, -1], [1, 0], [-1, 0], [0, 1], [0, -1]])
-    plus, up, down, minus, a, b, c, d = (cost(optimum.x + shift) for shift in shifts)
-    across = (plus - up - down + minus) / 4.0
-    curvature = np.array([[a + b - 2 * optimum.fun, across], [across, c + d - 2 * optimum.fun]]) / step**2
-    variance = float(np.linalg.inv(curvature)[0, 0])
-    if not variance > 0.0:
-        return 0.0, None
-    return float(std), (float(dead_zone), float(dead_zone * np.sqrt(variance)))
 
 
 def _estimate_drift(readings: np.ndarray) -> float:

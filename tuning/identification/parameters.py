@@ -13,7 +13,7 @@ from tuning.identification.cut_zone import draw_zone
 from tuning.identification.rational import MotionModel
 
 SIMULATOR_PREFIX, CUTOFF_KEY = "rig.simulator.", "rig.force_sensor.filter.cutoff"
-DEAD_ZONE_KEY = "rig.force_sensor.dead_zone"
+DEAD_ZONE_KEY, BIAS_KEY = "rig.force_sensor.dead_zone", "rig.force_sensor.bias"
 
 
 def make_simulator_section(model: MotionModel) -> dict[str, Any]:
@@ -100,14 +100,22 @@ def convert_contact_draws(contact: ContactFit) -> dict[str, np.ndarray]:
         result["contact.damping.0"] = draws_by_name["damping"]
     if contact.readings.zone:
         result[DEAD_ZONE_KEY] = draw_zone(contact.problem, contact.posterior)
-    elif contact.dead_zone and (stated := contact.readings.subtracted):
-        deviations = np.random.default_rng(0).standard_normal(len(draws))
-        size = stated * (1.0 + SPECIFIED_DEAD_ZONE_STD * deviations)
-        result |= {DEAD_ZONE_KEY: size, "rig.force_sensor.bias": draws_by_name["bias"] + size}
     elif contact.dead_zone:
-        # Adding 0.0 changes -0.0, which would be printed with its sign, to 0.0.
-        result[DEAD_ZONE_KEY] = np.maximum(-draws_by_name["bias"], 0.0) + 0.0
+        result |= _draw_dead_zone(contact, draws_by_name["bias"])
     return result
+
+
+def _draw_dead_zone(contact: ContactFit, offset: np.ndarray) -> dict[str, np.ndarray]:
+    """Return draws of a continuous dead zone [N] and of the bias [N]; `offset` is their difference."""
+    normal = np.random.default_rng(0).standard_normal(len(offset))
+    if stated := contact.readings.subtracted:
+        size = stated * (1.0 + SPECIFIED_DEAD_ZONE_STD * normal)
+    elif contact.hidden_noise is not None:
+        size = contact.hidden_noise.draw_zone(-offset, normal)
+    else:
+        # Adding 0.0 changes -0.0, which would be printed with its sign, to 0.0.
+        return {DEAD_ZONE_KEY: np.maximum(-offset, 0.0) + 0.0}
+    return {DEAD_ZONE_KEY: size, BIAS_KEY: offset + size}
 
 
 def make_contact_section(law: Law, values: dict[str, float]) -> dict[str, Any]:
