@@ -35,6 +35,7 @@ MAX_CELL_WIDTH_RATIO = 3.0  # maximum width of a cell, divided by the mean width
 MAX_CELL_EDGES = 1000  # maximum number of cell edges; an uncertain surface position would need more
 COARSE_STD_FACTOR = 2.0  # the coarse grid's standard deviation of the surface is multiplied by this factor
 FINAL_GRID_DELAYS, FINAL_GRID_SURFACES = 61, 13  # numbers of delays and surface positions of the final grid
+MAX_SURFACE_STD = 0.01  # upper limit of the surface position's standard deviation [m]
 DELAY_SEARCH_HALF_WIDTH = 0.003  # half width of the search around an approximate delay [s]
 SURFACE_HALF_WIDTH_SIGMAS = 3.2  # half width of the grid of surface positions [standard deviations]
 POSTERIOR_DRAWS = 4000  # number of posterior draws
@@ -154,12 +155,16 @@ def _scan_delays(
     for i in np.argsort(misfits) if has_steps(problem) else ():
         optima[i] = find_best_surface(problem, float(delays[i]), optima[i][0], best + COARSE_GRID_DROP)
         best = min(best, optima[i][1].misfit - 2.0 * optima[i][2])
-    planes, stds, heights = [], [], []
-    for plane, inner, gain in optima:
-        stds.append(1.0 if problem.plane is not None else 1.0 / np.sqrt(max(inner.curvature, 1e-300)))
-        planes.append(plane)
-        heights.append(inner.evidence + gain + np.log(stds[-1]))
-    return np.array(planes), np.array(stds), np.array(heights)
+    planes, curvatures, heights = np.array(
+        [(plane, inner.curvature, inner.evidence + gain) for plane, inner, gain in optima]
+    ).T
+    stds = np.ones(len(delays))
+    if problem.plane is None:
+        # Where rounding makes the curvature negative, its value at the neighbouring delays is used.
+        rises = curvatures > 0.0
+        least = np.interp(delays, delays[rises], curvatures[rises]) if rises.any() else np.zeros(len(delays))
+        stds = 1.0 / np.sqrt(np.maximum(least, MAX_SURFACE_STD**-2))
+    return planes, stds, heights + np.log(stds)
 
 
 def _follow_surface(

@@ -13,11 +13,10 @@ import numpy as np
 from scipy import special
 
 from tuning.identification.contact_problem import ContactProblem
-from tuning.identification.contact_profile import POSTERIOR_DRAWS, Posterior
+from tuning.identification.contact_profile import MAX_SURFACE_STD, POSTERIOR_DRAWS, Posterior
 from tuning.identification.normal_draws import factorise_covariance
 from tuning.identification.surface_search import find_best_surface
 
-MAX_SURFACE_STD = 0.01  # upper limit of the surface position's standard deviation [m]
 MAX_REDRAWS = 50  # maximum number of repetitions of draws with a negative damping coefficient
 
 
