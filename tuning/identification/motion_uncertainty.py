@@ -6,7 +6,8 @@ short, and changes stiffness, damping and surface position as well. Many reading
 the contact so precisely that these changes exceed the noise of the fit by far.
 
 The contact is therefore fitted again with models that differ from the estimate by one standard deviation, in
-one direction of the parameter space each. To first order, the effects of all directions add up.
+one direction of the parameter space each. To first order, the effects of all directions add up. If a change
+of the force delay alone compensates for all these differences, no fit is repeated.
 """
 
 from __future__ import annotations
@@ -27,6 +28,9 @@ from tuning.identification.rational import MotionModel
 from tuning.identification.records import CampaignTiming, LoggedRun
 
 TIME_CONSTANT_NAME, DAMPING_NAME = "time_constant", "damping"
+# Norm of the change of all predicted readings, in standard deviations, below which a fit would not change.
+MAX_CHANGE = 0.2
+TIME_STEP = 1e-6  # step of finite differences with respect to the delay [s]
 MIN_SINGULAR_VALUE = 1e-10  # minimum relative singular value of the linearised fit
 
 
@@ -92,8 +96,36 @@ def _compute_effects(
 
     if contact.problem.time_constant:
         return np.array([_linearise(contact, respond(column), respond(-column)) for column in factor.T])
+    motions = [respond(column) for column in factor.T]
+    delays, changes = np.transpose([_compensate_by_delay(contact, motion) for motion in motions])
+    if np.linalg.norm(changes) < MAX_CHANGE:
+        effects = np.zeros((len(motions), len(contact.posterior.names)))
+        effects[:, 0] = delays
+        return effects
     usual = _refit(contact, contact.problem.motion, seed)
-    return np.array([_refit(contact, respond(column), seed) - usual for column in factor.T])
+    return np.array([_refit(contact, motion, seed) - usual for motion in motions])
+
+
+def _compensate_by_delay(contact: ContactFit, motion: MotionResponse) -> tuple[float, float]:
+    """Return the change of the force delay [s] that compensates best for another motion, and what it leaves.
+
+    The second value is the norm of the remaining change of all predicted readings, in standard deviations of
+    the noise. It is an upper bound of the change of any parameter in a fit, in standard deviations.
+    """
+    delay, plane, fit = contact.posterior.best
+    usual, shift = contact.problem.motion, contact.problem.motion.delay - motion.delay
+    values = np.array([delay, plane, *fit.coefficients])
+    by_delay = np.eye(len(values))[0]
+    slope_square = slope_change = change_square = 0.0
+    for lanes in _divide_lanes(contact.readings.force.shape[1]):
+        now = _predict(contact, usual.of(lanes), lanes, values)
+        slope = (_predict(contact, usual.of(lanes), lanes, values + TIME_STEP * by_delay) - now) / TIME_STEP
+        change = _predict(contact, motion.of(lanes), lanes, values + shift * by_delay) - now
+        slope_square += float(slope @ slope)
+        slope_change += float(slope @ change)
+        change_square += float(change @ change)
+    further = slope_change / slope_square if slope_square else 0.0
+    return shift - further, float(np.sqrt(max(change_square - further * slope_change, 0.0)))
 
 
 def _refit(contact: ContactFit, motion: MotionResponse, seed: int) -> np.ndarray:
