@@ -10,7 +10,7 @@ intervals and correlations, come from draws of the posterior.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy import special
@@ -61,6 +61,19 @@ class Posterior:
         return np.cov(self.draws.T)
 
 
+class _Profile(NamedTuple):
+    """Best or mean surface position at each force delay, with the log posterior."""
+
+    delays: np.ndarray  # s, in ascending order
+    planes: np.ndarray  # surface position [m]
+    stds: np.ndarray  # standard deviation of the surface position [m]
+    heights: np.ndarray  # log posterior, up to a constant
+
+    @property
+    def best_delay(self) -> float:
+        return float(self.delays[np.argmax(self.heights)])
+
+
 def compute_posterior(
     problem: ContactProblem,
     seed: int = 0,
@@ -76,54 +89,52 @@ def compute_posterior(
             the best delay may be far from the approximate one.
         size: Numbers of delays and surface positions of the final grid.
     """
-    delays, start = (
-        np.arange(problem.min_delay, MAX_FORCE_DELAY + COARSE_DELAY_STEP / 2.0, COARSE_DELAY_STEP),
-        0.0,
-    )
-    scanned = None
-    if near is not None:
-        close, start = (
-            near[0]
-            + np.arange(
-                -DELAY_SEARCH_HALF_WIDTH, DELAY_SEARCH_HALF_WIDTH + COARSE_DELAY_STEP / 2.0, COARSE_DELAY_STEP
-            ),
-            near[1],
-        )
-        close = np.unique(np.clip(close, problem.min_delay, MAX_FORCE_DELAY))
-        scanned = _scan_delays(problem, close, start)
-        is_likely = 2.0 * (scanned[2].max() - scanned[2][[0, -1]]) <= FINAL_GRID_DROP
-        inner = close[0] > problem.min_delay, close[-1] < MAX_FORCE_DELAY
-        if np.any(is_likely & inner):
-            scanned = None
-        else:
-            delays = close
-    elif problem.plane is None:
-        start = estimate_surface_from_onset(problem, MAX_FORCE_DELAY / 4.0)
-    start = start if problem.plane is None else problem.plane
-    planes, stds, heights = scanned or _scan_delays(problem, delays, start)
-    low, high = _find_likely_delays(problem, delays, heights, COARSE_GRID_DROP)
-    finer = np.linspace(low, high, int(np.clip((high - low) / FINE_DELAY_STEP, 21, 151)))
-    surface = np.interp(finer, delays, planes), np.interp(finer, delays, stds)
-    if has_steps(problem):
-        followed, heights = _follow_surface(problem, finer, surface[0], float(delays[np.argmax(heights)]))
-        low, high = _find_likely_delays(problem, finer, heights, FINAL_GRID_DROP)
-        in_range = (finer >= low) & (finer <= high)
-        finer, surface = finer[in_range], (followed[in_range], surface[1][in_range])
-    places, cells = _fit_grid(
-        problem, finer, (surface[0], COARSE_STD_FACTOR * surface[1]), SECOND_GRID_SURFACES
-    )
-    heights, planes, spreads = _marginalise_over_surface(places, cells, len(finer))
-    low, high = _find_likely_delays(problem, finer, heights, FINAL_GRID_DROP)
+    profile = _refine(problem, _scan_coarsely(problem, near))
+    low, high = _find_likely_delays(problem, profile.delays, profile.heights, FINAL_GRID_DROP)
     delays = np.linspace(low, high, size[0])
     # If one cell contains the whole posterior at a delay, the estimated surface position jumps from delay to
     # delay: smooth it.
-    planes = uniform_filter1d(planes, SMOOTHING_DELAYS, mode="nearest")
-    best = float(finer[np.argmax(heights)])
-    surface = np.interp(delays, finer, planes), np.interp(delays, finer, np.maximum(spreads, surface[1]))
+    planes = uniform_filter1d(profile.planes, SMOOTHING_DELAYS, mode="nearest")
+    planes, stds = (np.interp(delays, profile.delays, values) for values in (planes, profile.stds))
     if has_steps(problem):
-        surface = _follow_surface(problem, delays, surface[0], best)[0], surface[1]
-    places, cells = _fit_grid(problem, delays, surface, size[1])
+        planes, _ = _follow_surface(problem, delays, planes, profile.best_delay)
+    places, cells = _fit_grid(problem, delays, (planes, stds), size[1])
     return _draw_from_grid(problem, places, cells, delays, seed)
+
+
+def _scan_coarsely(problem: ContactProblem, near: tuple[float, float] | None) -> _Profile:
+    """Scan the delays in coarse steps: those near an approximate one or, if the best may be far, all."""
+    start = 0.0
+    if near is not None:
+        start = near[1] if problem.plane is None else problem.plane
+        reach = DELAY_SEARCH_HALF_WIDTH
+        delays = near[0] + np.arange(-reach, reach + COARSE_DELAY_STEP / 2.0, COARSE_DELAY_STEP)
+        delays = np.unique(np.clip(delays, problem.min_delay, MAX_FORCE_DELAY))
+        profile = _scan_delays(problem, delays, start)
+        heights = profile.heights
+        is_likely = 2.0 * (heights.max() - heights[[0, -1]]) <= FINAL_GRID_DROP
+        if not np.any(is_likely & (delays[0] > problem.min_delay, delays[-1] < MAX_FORCE_DELAY)):
+            return profile
+    elif problem.plane is None:
+        start = estimate_surface_from_onset(problem, MAX_FORCE_DELAY / 4.0)
+    delays = np.arange(problem.min_delay, MAX_FORCE_DELAY + COARSE_DELAY_STEP / 2.0, COARSE_DELAY_STEP)
+    return _scan_delays(problem, delays, start if problem.plane is None else problem.plane)
+
+
+def _refine(problem: ContactProblem, coarse: _Profile) -> _Profile:
+    """Return the profile at finer steps, where it is likely, from a grid of surface positions."""
+    low, high = _find_likely_delays(problem, coarse.delays, coarse.heights, COARSE_GRID_DROP)
+    delays = np.linspace(low, high, int(np.clip((high - low) / FINE_DELAY_STEP, 21, 151)))
+    planes = np.interp(delays, coarse.delays, coarse.planes)
+    if has_steps(problem):
+        planes, heights = _follow_surface(problem, delays, planes, coarse.best_delay)
+        low, high = _find_likely_delays(problem, delays, heights, FINAL_GRID_DROP)
+        in_range = (delays >= low) & (delays <= high)
+        delays, planes = delays[in_range], planes[in_range]
+    stds = np.interp(delays, coarse.delays, coarse.stds)
+    places, cells = _fit_grid(problem, delays, (planes, COARSE_STD_FACTOR * stds), SECOND_GRID_SURFACES)
+    heights, planes, spreads = _marginalise_over_surface(places, cells, len(delays))
+    return _Profile(delays, planes, np.maximum(spreads, stds), heights)
 
 
 def estimate_surface_from_onset(problem: ContactProblem, delay: float) -> float:
@@ -145,10 +156,8 @@ def estimate_surface_from_onset(problem: ContactProblem, delay: float) -> float:
     return float(np.median(crossings)) if crossings else 0.0
 
 
-def _scan_delays(
-    problem: ContactProblem, delays: np.ndarray, start: float
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Find, from `start`, the best surface position at each delay; return it, its std and log posterior."""
+def _scan_delays(problem: ContactProblem, delays: np.ndarray, start: float) -> _Profile:
+    """Find the best surface position at each delay, from `start` [m]."""
     optima = [find_best_surface(problem, delay, start, -np.inf) for delay in delays]
     misfits = [inner.misfit - 2.0 * gain for _, inner, gain in optima]
     best = min(misfits)
@@ -164,7 +173,7 @@ def _scan_delays(
         rises = curvatures > 0.0
         least = np.interp(delays, delays[rises], curvatures[rises]) if rises.any() else np.zeros(len(delays))
         stds = 1.0 / np.sqrt(np.maximum(least, MAX_SURFACE_STD**-2))
-    return planes, stds, heights + np.log(stds)
+    return _Profile(delays, planes, stds, heights + np.log(stds))
 
 
 def _follow_surface(
