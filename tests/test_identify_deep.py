@@ -107,3 +107,8 @@ def test_noise_filter_of_a_run_does_not_depend_on_other_runs(whitening):
         residuals = alone.whiten(alone.readings.force - alone.force(0.002, 0.0, inner.coefficients))
         misfit += float(np.sum((residuals[alone.readings.counts] / 0.5) ** 2))
     assert misfit == pytest.approx(inner.misfit, rel=1e-9)
+
+
+def test_fit_of_a_long_press_run_is_reproducible():
+    fits = [summarise_deep_lanes(problem(kelvin_voigt()), (0.0037, 0.0)).at(0.00371, 1e-6) for _ in range(2)]
+    np.testing.assert_array_equal(fits[0].coefficients, fits[1].coefficients)

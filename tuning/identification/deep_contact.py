@@ -289,4 +289,5 @@ def _chebyshev_nodes(low: float, high: float, count: int) -> np.ndarray:
 
 def _interpolator(nodes: np.ndarray) -> BarycentricInterpolator:
     """Return a function that computes the weights of the nodes for polynomial interpolation at a point."""
-    return BarycentricInterpolator(nodes, np.eye(len(nodes)))
+    # Without a seed, SciPy sums in random order, so that the last digits of results would change.
+    return BarycentricInterpolator(nodes, np.eye(len(nodes)), rng=0)
