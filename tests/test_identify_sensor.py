@@ -8,7 +8,7 @@ from scipy import signal
 
 import jaxhil
 from jaxhil.mechanism.sensor_filter import find_modes
-from tuning.identification.cut_zone import estimate_hidden_bias, find_largest_size
+from tuning.identification.cut_zone import estimate_bias_before_contact, find_largest_size
 from tuning.identification.identify import IdentificationOptions, identify
 from tuning.identification.logs.campaign import read_campaign
 from tuning.identification.nearby_rows import Onsets
@@ -107,12 +107,12 @@ def test_hidden_bias_and_largest_size_of_cut_zone_are_estimated_from_noise():
     readings = 0.2 + 0.5 * np.random.default_rng(0).standard_normal(8000)
     runs = runs_at_rest(np.where(np.abs(readings) > 0.9, readings, 0.0))
     assert 0.9 < find_largest_size(runs) < 0.91
-    bias = estimate_hidden_bias(runs, 0.9)
+    bias = estimate_bias_before_contact(runs, 0.9)
     assert abs(bias[0] - 0.2) < 3.0 * bias[1] < 0.06
     continuous = np.sign(readings) * np.maximum(np.abs(readings) - 0.9, 0.0)
-    same = estimate_hidden_bias(runs_at_rest(continuous), 0.9, True)
+    same = estimate_bias_before_contact(runs_at_rest(continuous), 0.9, True)
     assert same[0] == pytest.approx(bias[0], abs=1e-5) and same[1] == pytest.approx(bias[1], rel=0.1)
-    assert estimate_hidden_bias(runs_at_rest(np.zeros(8000)), 0.9) == (0.0, pytest.approx(0.18))
+    assert estimate_bias_before_contact(runs_at_rest(np.zeros(8000)), 0.9) == (0.0, pytest.approx(0.18))
 
 
 @pytest.mark.slow

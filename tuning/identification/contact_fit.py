@@ -20,7 +20,7 @@ from tuning.identification.clock_drift import ClockDrift
 from tuning.identification.contact_laws import Law, kelvin_voigt
 from tuning.identification.contact_problem import MAX_FORCE_DELAY, ContactProblem
 from tuning.identification.contact_profile import Posterior, compute_posterior
-from tuning.identification.cut_zone import estimate_hidden_bias, find_largest_size
+from tuning.identification.cut_zone import estimate_bias_before_contact, find_largest_size
 from tuning.identification.deep_contact import summarise_deep_lanes
 from tuning.identification.force_readings import ForceReadings
 from tuning.identification.hidden_noise import HiddenNoise
@@ -132,7 +132,13 @@ def fit_contact(
     problem, posterior = _fit_laws(motion, readings, laws, plane, near, seed)
     law = problem.law
     is_visible = not (readings.zone or _has_dead_zone(posterior))
-    if noise_is_hidden and is_visible and not _is_silent_outside(runs, problem, posterior):
+    is_estimated = noise is not None and noise.hidden is not None
+    if (
+        noise_is_hidden
+        and not is_estimated
+        and is_visible
+        and not _is_silent_outside(runs, problem, posterior)
+    ):
         # Without a dead zone, readings of 0 at rest hide the noise: estimate it from the contacts.
         return fit_contact(runs, model, timing, None, law, plane_option, seed, sensor)
     if noise_is_hidden and readings.bias is None and plane_option is None:
@@ -175,7 +181,7 @@ def _prepare_readings(
     if noise is not None and noise_is_hidden and noise.hidden is not None:
         prior = noise.hidden.missing_force
     if noise_is_hidden and zone and not cut:
-        hidden, std = estimate_hidden_bias(runs, zone, True)
+        hidden, std = estimate_bias_before_contact(runs, zone, True)
         prior = zone - hidden, float(np.hypot(std, SPECIFIED_DEAD_ZONE_STD * zone))
     low_pass = None if noise_is_hidden else sensor.filter
     if noise is None or noise_is_hidden or noise.std == 0.0:
@@ -183,7 +189,7 @@ def _prepare_readings(
         subtracted = zone if noise_is_hidden and not cut else 0.0
         readings = replace(readings, low_pass=low_pass, zone=cut, subtracted=subtracted)
         if cut:
-            readings = replace(readings, bias=estimate_hidden_bias(runs, cut))
+            readings = replace(readings, bias=estimate_bias_before_contact(runs, cut))
             return _estimate_noise_from_contact(motion, readings, plane, 0.0), plane
         usual = 0.0 if noise_is_hidden and plane is None else plane
         readings = _estimate_noise_from_contact(motion, readings, usual, 0.0 if noise is None else noise.std)

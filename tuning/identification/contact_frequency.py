@@ -17,12 +17,12 @@ def estimate_contact_frequency(contact: ContactFit | None, mass: float) -> float
     """
     if contact is None:
         return ASSUMED_CONTACT_FREQUENCY
-    delay, plane, coefficient_fit = contact.posterior.best
+    delay, plane, fit = contact.posterior.best
     position, _ = contact.problem.motion.at(delay)
     depth = np.where(contact.readings.counts, position - plane, 0.0)
-    force = np.where(
-        contact.readings.counts, contact.problem.force(delay, plane, coefficient_fit.coefficients), 0.0
-    )
+    # The last coefficient is the bias of the sensor or a dead zone, which the prediction includes.
+    force = contact.problem.force(delay, plane, fit.coefficients) - fit.coefficients[-1]
+    force = np.where(contact.readings.counts & (depth > 0.0), force, 0.0)
     deepest, lanes = np.argmax(depth, axis=0), np.arange(depth.shape[1])
     peak = force[deepest, lanes]
     # If the force of a contact is very small, noise dominates its secant stiffness.
@@ -33,4 +33,5 @@ def estimate_contact_frequency(contact: ContactFit | None, mass: float) -> float
 def compute_force_lag(contact: ContactFit, model: MotionModel, frequency: float) -> float:
     """Return the phase delay [s] from the command to the force reading at a frequency [Hz]."""
     angle = float(np.angle(model.response(np.array([2j * np.pi * frequency]))[0]))
-    return contact.posterior.best[0] - angle / (2.0 * np.pi * frequency)
+    filter_delay = contact.problem.time_constant * contact.readings.modes.delay
+    return contact.posterior.best[0] + filter_delay - angle / (2.0 * np.pi * frequency)

@@ -66,7 +66,7 @@ class _Profile(NamedTuple):
 
     delays: np.ndarray  # s, in ascending order
     planes: np.ndarray  # surface position [m]
-    stds: np.ndarray  # standard deviation of the surface position [m]
+    stds: np.ndarray  # standard deviation of the surface position [m]; 1 if the position is specified
     heights: np.ndarray  # log posterior, up to a constant
 
     @property
@@ -92,10 +92,7 @@ def compute_posterior(
     profile = _refine(problem, _scan_coarsely(problem, near))
     low, high = _find_likely_delays(problem, profile.delays, profile.heights, FINAL_GRID_DROP)
     delays = np.linspace(low, high, size[0])
-    # If one cell contains the whole posterior at a delay, the estimated surface position jumps from delay to
-    # delay: smooth it.
-    planes = uniform_filter1d(profile.planes, SMOOTHING_DELAYS, mode="nearest")
-    planes, stds = (np.interp(delays, profile.delays, values) for values in (planes, profile.stds))
+    planes, stds = (np.interp(delays, profile.delays, values) for values in (profile.planes, profile.stds))
     if has_steps(problem):
         planes, _ = _follow_surface(problem, delays, planes, profile.best_delay)
     places, cells = _fit_grid(problem, delays, (planes, stds), size[1])
@@ -104,9 +101,10 @@ def compute_posterior(
 
 def _scan_coarsely(problem: ContactProblem, near: tuple[float, float] | None) -> _Profile:
     """Scan the delays in coarse steps: those near an approximate one or, if the best may be far, all."""
-    start = 0.0
+    start = problem.plane
+    if start is None:
+        start = estimate_surface_from_onset(problem, MAX_FORCE_DELAY / 4.0) if near is None else near[1]
     if near is not None:
-        start = near[1] if problem.plane is None else problem.plane
         reach = DELAY_SEARCH_HALF_WIDTH
         delays = near[0] + np.arange(-reach, reach + COARSE_DELAY_STEP / 2.0, COARSE_DELAY_STEP)
         delays = np.unique(np.clip(delays, problem.min_delay, MAX_FORCE_DELAY))
@@ -115,10 +113,8 @@ def _scan_coarsely(problem: ContactProblem, near: tuple[float, float] | None) ->
         is_likely = 2.0 * (heights.max() - heights[[0, -1]]) <= FINAL_GRID_DROP
         if not np.any(is_likely & (delays[0] > problem.min_delay, delays[-1] < MAX_FORCE_DELAY)):
             return profile
-    elif problem.plane is None:
-        start = estimate_surface_from_onset(problem, MAX_FORCE_DELAY / 4.0)
     delays = np.arange(problem.min_delay, MAX_FORCE_DELAY + COARSE_DELAY_STEP / 2.0, COARSE_DELAY_STEP)
-    return _scan_delays(problem, delays, start if problem.plane is None else problem.plane)
+    return _scan_delays(problem, delays, start)
 
 
 def _refine(problem: ContactProblem, coarse: _Profile) -> _Profile:
@@ -134,6 +130,10 @@ def _refine(problem: ContactProblem, coarse: _Profile) -> _Profile:
     stds = np.interp(delays, coarse.delays, coarse.stds)
     places, cells = _fit_grid(problem, delays, (planes, COARSE_STD_FACTOR * stds), SECOND_GRID_SURFACES)
     heights, planes, spreads = _marginalise_over_surface(places, cells, len(delays))
+    if not has_steps(problem):
+        # If one cell contains the whole posterior at a delay, the estimated surface position jumps from delay
+        # to delay: smooth it.
+        planes = uniform_filter1d(planes, SMOOTHING_DELAYS, mode="nearest")
     return _Profile(delays, planes, np.maximum(spreads, stds), heights)
 
 
@@ -160,6 +160,7 @@ def _scan_delays(problem: ContactProblem, delays: np.ndarray, start: float) -> _
     """Find the best surface position at each delay, from `start` [m]."""
     optima = [find_best_surface(problem, delay, start, -np.inf) for delay in delays]
     misfits = [inner.misfit - 2.0 * gain for _, inner, gain in optima]
+    # Scan the steps of the misfit only where it may come close to the best, from the best delay on.
     best = min(misfits)
     for i in np.argsort(misfits) if has_steps(problem) else ():
         optima[i] = find_best_surface(problem, float(delays[i]), optima[i][0], best + COARSE_GRID_DROP)
@@ -170,9 +171,9 @@ def _scan_delays(problem: ContactProblem, delays: np.ndarray, start: float) -> _
     stds = np.ones(len(delays))
     if problem.plane is None:
         # Where rounding makes the curvature negative, its value at the neighbouring delays is used.
-        rises = curvatures > 0.0
-        least = np.interp(delays, delays[rises], curvatures[rises]) if rises.any() else np.zeros(len(delays))
-        stds = 1.0 / np.sqrt(np.maximum(least, MAX_SURFACE_STD**-2))
+        valid = curvatures > 0.0
+        filled = np.interp(delays, delays[valid], curvatures[valid]) if valid.any() else 0.0 * curvatures
+        stds = 1.0 / np.sqrt(np.maximum(filled, MAX_SURFACE_STD**-2))
     return _Profile(delays, planes, stds, heights + np.log(stds))
 
 
@@ -187,7 +188,8 @@ def _follow_surface(
     Args:
         problem: Readings, motion and contact law.
         delays: Delays [s], in ascending order.
-        planes: Approximate surface positions [m], one per delay.
+        planes: Approximate surface positions [m], one per delay; that at `first` starts the search, and those
+            at omitted delays remain.
         first: Delay [s] at which the search begins; it proceeds to both sides.
     """
     planes, begin = planes.copy(), int(np.argmin(np.abs(delays - first)))

@@ -11,9 +11,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from tuning.identification import hidden_noise
 from tuning.identification.contact_problem import ContactProblem
 from tuning.identification.contact_profile import POSTERIOR_DRAWS, Posterior
+from tuning.identification.hidden_noise import compute_log_probability_of_zero, estimate_hidden_bias
 from tuning.identification.noise import detect_quantum
 from tuning.identification.records import LoggedRun
 
@@ -33,7 +33,7 @@ def find_largest_size(runs: Sequence[LoggedRun]) -> float:
     return float(sizes.min()) + 0.5 * detect_quantum(readings) if len(sizes) else 0.0
 
 
-def estimate_hidden_bias(
+def estimate_bias_before_contact(
     runs: Sequence[LoggedRun], zone: float, is_subtracted: bool = False
 ) -> tuple[float, float]:
     """Estimate the bias of the readings before contact although a dead zone replaces most of them by 0.
@@ -49,7 +49,7 @@ def estimate_hidden_bias(
         Mean and standard deviation of the bias [N]; assumed values if too few readings exceed the zone.
     """
     before = np.concatenate([_take_readings_before_contact(run) for run in runs])
-    estimate = hidden_noise.estimate_hidden_bias(before, zone, is_subtracted)
+    estimate = estimate_hidden_bias(before, zone, is_subtracted, detect_quantum(before))
     return (0.0, ASSUMED_BIAS_SHARE * zone) if estimate is None else estimate
 
 
@@ -70,10 +70,7 @@ def draw_zone(problem: ContactProblem, posterior: Posterior, seed: int = 0) -> n
         # Forces far inside the zone do not bound its size.
         predicted = predicted[predicted > 0.0]
         heights.append(
-            [
-                hidden_noise.compute_log_probability_of_zero(predicted, readings.std, size).sum()
-                for size in sizes
-            ]
+            [compute_log_probability_of_zero(predicted, readings.std, size).sum() for size in sizes]
         )
     # The readings of 0 also select the draws of the contact that agree with them.
     share = np.cumsum(np.exp(np.array(heights) - np.max(heights)).sum(axis=0))

@@ -45,7 +45,7 @@ def make_estimates(draws_by_key, motion, contact, force, position, fixed) -> tup
             )
         )
         if force is None or contact.readings.zone:
-            bias = contact.posterior.draws[:, contact.posterior.names.index("bias")]
+            bias = contact.draws()[:, contact.posterior.names.index("bias")]
             direct.append(
                 _make_normal_estimate("rig.force_sensor.bias", float(bias.mean()), float(bias.std()))
             )

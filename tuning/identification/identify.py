@@ -352,7 +352,7 @@ def _choose_position_delay(
     specified = 0.0 if prior is None else prior.rig.position_sensor.delay
     if motion is None or contact is None:
         return specified
-    delay = contact.posterior.draws[:, 0]
+    delay = contact.draws()[:, 0]
     # The mean of an uncertain delay may be negative by chance, hence the margin.
     mean, margin = float(delay.mean()), MIN_DELAY_SIGMAS * float(delay.std())
     return specified if mean + specified >= -margin else margin - mean

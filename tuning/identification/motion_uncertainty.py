@@ -7,7 +7,8 @@ the contact so precisely that these changes exceed the noise of the fit by far.
 
 The contact is therefore fitted again with models that differ from the estimate by one standard deviation, in
 one direction of the parameter space each. To first order, the effects of all directions add up. If a change
-of the force delay alone compensates for all these differences, no fit is repeated.
+of the force delay alone compensates for all these differences, no fit is repeated. If the sensor has a lag,
+linear least squares replace the fits.
 """
 
 from __future__ import annotations
@@ -28,10 +29,11 @@ from tuning.identification.rational import MotionModel
 from tuning.identification.records import CampaignTiming, LoggedRun
 
 TIME_CONSTANT_NAME, DAMPING_NAME = "time_constant", "damping"
-# Norm of the change of all predicted readings, in standard deviations, below which a fit would not change.
+# Norm of the change of all predicted readings [standard deviations of the noise]. Below it, no parameter
+# changes by more than this share of its standard deviation.
 MAX_CHANGE = 0.2
 TIME_STEP = 1e-6  # step of finite differences with respect to the delay [s]
-MIN_SINGULAR_VALUE = 1e-10  # minimum relative singular value of the linearised fit
+MIN_EIGENVALUE_RATIO = 1e-10  # minimum eigenvalue of a normal matrix, relative to the largest
 
 
 def add_motion_uncertainty(
@@ -87,17 +89,18 @@ def _compute_effects(
     seed: int,
 ) -> np.ndarray:
     """Return the change of the contact's parameters per column of `factor`, shape (columns, parameters)."""
-    longest = MAX_FORCE_DELAY + timing.control_period
     late = None if contact.drift is None else contact.drift.delays
 
     def respond(change: np.ndarray) -> MotionResponse:
         changed = replace(model, parameters=model.parameters + change)
+        # A force delay that is longer by the difference of the motion's delays compensates for it.
+        longest = MAX_FORCE_DELAY + timing.control_period + max(model.delay - changed.delay, 0.0)
         return MotionResponse(changed, runs, timing, longest, late)
 
     if contact.problem.time_constant:
         return np.array([_linearise(contact, respond(column), respond(-column)) for column in factor.T])
     motions = [respond(column) for column in factor.T]
-    delays, changes = np.transpose([_compensate_by_delay(contact, motion) for motion in motions])
+    delays, changes = _compensate_by_delay(contact, motions)
     if np.linalg.norm(changes) < MAX_CHANGE:
         effects = np.zeros((len(motions), len(contact.posterior.names)))
         effects[:, 0] = delays
@@ -106,26 +109,32 @@ def _compute_effects(
     return np.array([_refit(contact, motion, seed) - usual for motion in motions])
 
 
-def _compensate_by_delay(contact: ContactFit, motion: MotionResponse) -> tuple[float, float]:
-    """Return the change of the force delay [s] that compensates best for another motion, and what it leaves.
+def _compensate_by_delay(
+    contact: ContactFit, motions: Sequence[MotionResponse]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Compensate for other motions of the mechanism by a change of the force delay alone.
 
-    The second value is the norm of the remaining change of all predicted readings, in standard deviations of
-    the noise. It is an upper bound of the change of any parameter in a fit, in standard deviations.
+    Returns:
+        For each motion, the best change of the delay [s]; and the norm of the remaining change of all
+        predicted readings, in standard deviations of the noise.
     """
     delay, plane, fit = contact.posterior.best
-    usual, shift = contact.problem.motion, contact.problem.motion.delay - motion.delay
+    usual = contact.problem.motion
     values = np.array([delay, plane, *fit.coefficients])
     by_delay = np.eye(len(values))[0]
-    slope_square = slope_change = change_square = 0.0
+    shifts = np.array([usual.delay - motion.delay for motion in motions])
+    # Sums over all readings of the squared slope, the products with the slope, and the squared changes.
+    slope_square, products, squares = 0.0, np.zeros(len(motions)), np.zeros(len(motions))
     for lanes in _divide_lanes(contact.readings.force.shape[1]):
         now = _predict(contact, usual.of(lanes), lanes, values)
         slope = (_predict(contact, usual.of(lanes), lanes, values + TIME_STEP * by_delay) - now) / TIME_STEP
-        change = _predict(contact, motion.of(lanes), lanes, values + shift * by_delay) - now
         slope_square += float(slope @ slope)
-        slope_change += float(slope @ change)
-        change_square += float(change @ change)
-    further = slope_change / slope_square if slope_square else 0.0
-    return shift - further, float(np.sqrt(max(change_square - further * slope_change, 0.0)))
+        for i, (motion, shift) in enumerate(zip(motions, shifts, strict=True)):
+            change = _predict(contact, motion.of(lanes), lanes, values + shift * by_delay) - now
+            products[i] += slope @ change
+            squares[i] += change @ change
+    further = products / (slope_square or np.inf)
+    return shifts - further, np.sqrt(np.maximum(squares - further * products, 0.0))
 
 
 def _refit(contact: ContactFit, motion: MotionResponse, seed: int) -> np.ndarray:
@@ -139,8 +148,8 @@ def _refit(contact: ContactFit, motion: MotionResponse, seed: int) -> np.ndarray
     return compute_posterior(summarise_deep_lanes(problem, near), seed, near, COARSE_GRID_SIZE).mean
 
 
-def _linearise(contact: ContactFit, later: MotionResponse, earlier: MotionResponse) -> np.ndarray:
-    """Return the change of the parameters that compensates for half the difference of two motions.
+def _linearise(contact: ContactFit, plus: MotionResponse, minus: MotionResponse) -> np.ndarray:
+    """Return the change of the parameters that compensates for half the difference of `plus` and `minus`.
 
     A lag of the sensor smooths the force at the onset of contact, so that the predicted readings can be
     differentiated. The change of the parameters follows from linear least squares.
@@ -154,7 +163,7 @@ def _linearise(contact: ContactFit, later: MotionResponse, earlier: MotionRespon
     varying = np.flatnonzero(steps > 0.0)
     normal, right = np.zeros((len(varying), len(varying))), np.zeros(len(varying))
     for lanes in _divide_lanes(contact.readings.force.shape[1]):
-        usual, *others = (motion.of(lanes) for motion in (contact.problem.motion, later, earlier))
+        usual, *others = (motion.of(lanes) for motion in (contact.problem.motion, plus, minus))
         columns = []
         for i in varying:
             change = np.zeros(len(best))
@@ -171,7 +180,7 @@ def _linearise(contact: ContactFit, later: MotionResponse, earlier: MotionRespon
         bias = int(np.flatnonzero(varying == posterior.names.index("bias"))[0])
         normal[bias, bias] += (steps[varying[bias]] / contact.readings.bias[1]) ** 2
     result = np.zeros(len(best))
-    result[varying] = np.linalg.pinv(normal, MIN_SINGULAR_VALUE, hermitian=True) @ right * steps[varying]
+    result[varying] = np.linalg.pinv(normal, MIN_EIGENVALUE_RATIO, hermitian=True) @ right * steps[varying]
     return result
 
 

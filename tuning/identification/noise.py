@@ -65,7 +65,7 @@ def estimate_noise(readings: np.ndarray) -> NoiseEstimate:
     quantum = detect_quantum(readings)
     number = len(readings)
     if _has_excess_zeros(readings, quantum):
-        hidden = estimate_hidden_noise(readings)
+        hidden = estimate_hidden_noise(readings, quantum)
         std = 0.0 if hidden is None else hidden.std
         return NoiseEstimate(0.0, std, np.inf, np.inf, quantum, True, (1.0,), number, 0.0, hidden)
     if np.ptp(readings) == 0.0:

@@ -106,7 +106,7 @@ def convert_contact_draws(contact: ContactFit) -> dict[str, np.ndarray]:
 
 
 def _draw_dead_zone(contact: ContactFit, offset: np.ndarray) -> dict[str, np.ndarray]:
-    """Return draws of a continuous dead zone [N] and of the bias [N]; `offset` is their difference."""
+    """Return draws of a continuous dead zone [N] and of the bias [N]; `offset` is bias minus zone."""
     normal = np.random.default_rng(0).standard_normal(len(offset))
     if stated := contact.readings.subtracted:
         size = stated * (1.0 + SPECIFIED_DEAD_ZONE_STD * normal)

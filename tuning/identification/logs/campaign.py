@@ -80,12 +80,13 @@ def read_campaign(
     for entry in mapping.runs:
         paths = [path for path in logs if entry.names(path)]
         readings = [_RunsOfFile(path, entry, mapping, timing, mass, prior) for path in paths]
-        _check_runs(readings)
+        _check_any_run(readings)
         for reading in readings:
             runs += reading.runs
             for note in reading.notes:
                 notes.setdefault(note.removeprefix(f"{reading.label}: "), []).append(reading.label)
-            clocks.append(reading.ticks.clock)
+            if reading.runs:
+                clocks.append(reading.ticks.clock)
     integrator = detect_common_integrator(runs, timing.control_period) or (prior and prior.rig.integrator)
     if not timing.two_clocks:
         check_row_convention(runs, timing, integrator)
@@ -104,12 +105,12 @@ def check_names(logs: Sequence[Path], entries: Sequence[RunFiles]) -> None:
             )
 
 
-def _check_runs(readings: Sequence[_RunsOfFile]) -> None:
+def _check_any_run(readings: Sequence[_RunsOfFile]) -> None:
     """Raise `InputError` if none of the files of a `[[runs]]` entry has a run."""
     if readings and not any(reading.runs for reading in readings):
-        first, more = readings[0], len(readings) - 1
+        more, rows = len(readings) - 1, sum(len(reading.ticks.tick) for reading in readings)
         raise InputError(
-            f"{first.label}{f' and {more} more' * (more > 0)}: found no run in {len(first.ticks.tick)} rows, "
+            f"{readings[0].label}{f' and {more} more' * (more > 0)}: found no run in {rows} rows, "
             f"expected at least {MIN_SEGMENT_ROWS} successive rows; for the kinds contact and tap, with a "
             "contact"
         )
