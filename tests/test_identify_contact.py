@@ -276,3 +276,14 @@ def test_contact_intervals_include_uncertainty_of_motion_simulator(monkeypatch, 
         scores.append([(result[key].value - value) / result[key].std for key, value in true.items()])
     assert np.all(np.sqrt(np.mean(np.square(scores), axis=0)) < 2.0)
     assert np.sqrt(np.mean(np.square(scores))) > 0.6
+
+
+def test_motion_is_known_before_the_time_of_a_row():
+    """A negative sensor delay needs commands of later rows."""
+    runs = campaigns._touch_runs(campaigns.KINDS["clean"], np.random.default_rng(0), (0.006,))
+    timing = campaigns.campaign("clean", 0, speeds=(), seconds=0, rest=0).timing
+    early, late = (replace(SECOND, parameters=np.append(SECOND.parameters[:2], d)) for d in (-0.004, 0.001))
+    motion = MotionResponse(late, runs, timing, 0.022, shortest=-0.006)
+    np.testing.assert_allclose(
+        motion.at(-0.005), MotionResponse(early, runs, timing, 0.022).at(0.0), atol=1e-12
+    )

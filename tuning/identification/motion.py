@@ -36,6 +36,7 @@ class MotionResponse:
         timing: CampaignTiming,
         longest: float,
         late: np.ndarray | None = None,
+        shortest: float = 0.0,
     ):
         """Compute the states of the model at all ticks.
 
@@ -46,6 +47,8 @@ class MotionResponse:
             longest: Longest sensor delay [s] that `at` must support, without the delay of the model.
             late: Delay [s] that a separate clock adds to the force readings of each run, or None. The mean
                 of `LoggedRun.force_late` is subtracted from it.
+            shortest: Shortest sensor delay [s] that `at` must support; it may be negative. Sums with the
+                delay of the model that are not negative are always supported.
         """
         self.delay, self.period = model.delay, timing.control_period
         if any(run.force_late is not None for run in runs):
@@ -64,7 +67,8 @@ class MotionResponse:
         self.history = int(np.ceil(longest / self.period)) + timing.command_latency + 4
         # If readings in a row belong to later ticks, or a delay is negative, commands of later ticks are
         # needed.
-        ahead = max(1, -self.shift) + int(np.ceil((max(-self.delay, 0.0) - least) / self.period))
+        earliest = min(self.delay + min(shortest, 0.0), 0.0) + least
+        ahead = max(1, -self.shift) + int(np.ceil(-earliest / self.period))
         command = self._commands(runs, ahead)
         latency = timing.command_latency
         self.end = command[1 : len(command) - latency]

@@ -93,9 +93,10 @@ def _compute_effects(
 
     def respond(change: np.ndarray) -> MotionResponse:
         changed = replace(model, parameters=model.parameters + change)
-        # A force delay that is longer by the difference of the motion's delays compensates for it.
-        longest = MAX_FORCE_DELAY + timing.control_period + max(model.delay - changed.delay, 0.0)
-        return MotionResponse(changed, runs, timing, longest, late)
+        # A force delay that is longer or shorter by the difference of the motion's delays compensates for it.
+        difference = abs(model.delay - changed.delay)
+        longest = MAX_FORCE_DELAY + timing.control_period + difference
+        return MotionResponse(changed, runs, timing, longest, late, contact.problem.min_delay - difference)
 
     if contact.problem.time_constant:
         return np.array([_linearise(contact, respond(column), respond(-column)) for column in factor.T])
