@@ -131,14 +131,9 @@ def fit_contact(
     laws = (law, kelvin_voigt()) if evaluated and law.pulls else (law,)
     problem, posterior = _fit_laws(motion, readings, laws, plane, near, seed)
     law = problem.law
-    is_visible = not (readings.zone or _has_dead_zone(posterior))
     is_estimated = noise is not None and noise.hidden is not None
-    if (
-        noise_is_hidden
-        and not is_estimated
-        and is_visible
-        and not _is_silent_outside(runs, problem, posterior)
-    ):
+    is_visible = not (readings.zone or is_estimated or _has_dead_zone(posterior))
+    if noise_is_hidden and is_visible and not _is_silent_outside(runs, problem, posterior):
         # Without a dead zone, readings of 0 at rest hide the noise: estimate it from the contacts.
         return fit_contact(runs, model, timing, None, law, plane_option, seed, sensor)
     if noise_is_hidden and readings.bias is None and plane_option is None:
