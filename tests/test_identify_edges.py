@@ -169,6 +169,22 @@ def test_stated_cut_dead_zone_is_compared_with_noise_out_of_contact(monkeypatch,
     assert result.good == is_cut
 
 
+@pytest.mark.parametrize(
+    ("size", "bias", "finding"),
+    [
+        (3.0, 0.0, []),
+        (1.0, -2.0, ["100% of the readings without contact are 0, expected 2% with a bias of -2 N"]),
+    ],
+)
+def test_bias_that_dead_zone_would_not_hide_contradicts_zeros_at_rest(monkeypatch, size, bias, finding):
+    campaign = zoned(ambiguous.campaign(monkeypatch, "plain", 0, seconds=5.0), 3.0, False)
+    raw = to_plain_data(ambiguous.truth("plain"))
+    raw["rig"]["force_sensor"] |= {"dead_zone": size, "bias": bias, "noise_std": 0.5}
+    result = check_against_mechanism(campaign, from_plain_data(raw, "truth"))
+    findings = [line.finding for line in result.lines if line.name == "dead zone of the force sensor"]
+    assert findings == finding and result.good == (not finding)
+
+
 @pytest.mark.parametrize("is_cut", [True, False])
 def test_cut_dead_zone_that_the_noise_exceeds_is_detected(monkeypatch, is_cut):
     campaign = zoned(ambiguous.campaign(monkeypatch, "plain", 0, seconds=5.0), 1.0, is_cut)

@@ -107,6 +107,8 @@ def test_identify_verdict_is_good_for_campaign_of_independent_simulator(tmp_path
         ("resampled_force", 6004, "interpolated"),
         ("butterworth_4", 8034, "with a filter of order"),
         ("butterworth_2", 8033, "with a filter of order"),
+        ("butterworth_2", 9832, "with a filter of order"),
+        ("cut_dead_zone", 9845, "dead zone"),
     ],
 )
 def test_identify_names_defect_of_sensor_that_residuals_hardly_show(kind, seed, word, tmp_path):

@@ -64,6 +64,13 @@ def test_noise_at_rest_is_unknown_for_mostly_zero_readings():
     assert not estimate_noise(signal).silent
 
 
+def test_single_reading_beyond_dead_zone_shows_no_rounding():
+    readings = np.zeros(2500)
+    readings[1000] = -2.0
+    result = estimate_noise(readings)
+    assert result.silent and result.quantum == 0.0
+
+
 @pytest.mark.parametrize(("quantum", "noise"), [(0.0, 0.0), (0.1, 0.0), (0.0, 0.3), (0.1, 0.3)])
 def test_readings_in_contact_distinguish_missing_noise_from_dead_zone(quantum, noise):
     force = 80.0 * np.sin(np.linspace(0.0, np.pi, 200)) + noise * np.random.default_rng(0).normal(size=200)

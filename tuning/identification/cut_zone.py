@@ -48,9 +48,18 @@ def estimate_bias_before_contact(
     Returns:
         Mean and standard deviation of the bias [N]; assumed values if too few readings exceed the zone.
     """
-    before = np.concatenate([_take_readings_before_contact(run) for run in runs])
+    before = np.concatenate([take_readings_before_contact(run) for run in runs])
     estimate = estimate_hidden_bias(before, zone, is_subtracted, detect_quantum(before))
     return (0.0, ASSUMED_BIAS_SHARE * zone) if estimate is None else estimate
+
+
+def take_readings_before_contact(run: LoggedRun) -> np.ndarray:
+    """Return the first half of the readings that precede the first large force."""
+    force = run.valid_forces
+    if not len(force):
+        return force
+    loud = np.abs(force) > MIN_LOUD_SHARE * np.abs(force).max(initial=0.0)
+    return force[: int(np.argmax(loud)) // 2]
 
 
 def draw_zone(problem: ContactProblem, posterior: Posterior, seed: int = 0) -> np.ndarray:
@@ -76,12 +85,3 @@ def draw_zone(problem: ContactProblem, posterior: Posterior, seed: int = 0) -> n
     share = np.cumsum(np.exp(np.array(heights) - np.max(heights)).sum(axis=0))
     uniform = np.random.default_rng([seed, 5]).uniform(size=POSTERIOR_DRAWS)
     return np.interp(uniform, np.append(0.0, share / share[-1]), np.append(0.0, sizes))
-
-
-def _take_readings_before_contact(run: LoggedRun) -> np.ndarray:
-    """Return the first half of the readings that precede the first large force."""
-    force = run.valid_forces
-    if not len(force):
-        return force
-    loud = np.abs(force) > MIN_LOUD_SHARE * np.abs(force).max(initial=0.0)
-    return force[: int(np.argmax(loud)) // 2]

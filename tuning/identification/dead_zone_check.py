@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from scipy import special
 
 from jaxhil.mechanism.structs import Mechanism
 from tuning.identification.contact_fit import ContactFit
+from tuning.identification.cut_zone import take_readings_before_contact
 from tuning.identification.records import LoggedRun
 from tuning.identification.validation import CheckResult
 
@@ -21,6 +24,9 @@ SHIFTED_TICKS = 3.0
 MIN_READINGS_OUTSIDE_ZONE = 20  # minimum expected number of readings that exceed a stated zone
 ZONE_TOLERANCE = 0.1  # maximum error of a stated size, divided by the size
 MIN_OUTSIDE_SHARE = 0.2  # minimum ratio of readings that exceed a stated zone to their expected number
+BIAS_SIGMAS = 3.0  # largest error of the bias in the check of zeros, in standard deviations
+MIN_READINGS_AT_REST = 100  # least number of readings without contact for the check of zeros
+MAX_ZERO_SHARE_ERROR = 0.2  # largest error of the expected share of zeros
 
 
 def check_cut_dead_zone(contact: ContactFit, runs: list[LoggedRun]) -> list[CheckResult]:
@@ -72,6 +78,43 @@ def check_zone_sampling(mechanism: Mechanism) -> list[CheckResult]:
     effect = SHIFTED_TICKS * size * rig.control_period / mechanism.bodies.mass / mechanism.approach.velocity
     finding = f"readings jump by {size:.2g} N, and the tick of the jump differs from contact to contact"
     return [CheckResult("sampling of the dead zone", finding, True, effect)]
+
+
+def check_zeros_at_rest(
+    contact: ContactFit, mechanism: Mechanism, runs: Sequence[LoggedRun]
+) -> list[CheckResult]:
+    """Check that a continuous dead zone and the bias explain how many readings are 0 without contact.
+
+    A reading is 0 if the force with bias and noise lies inside the zone. If the zone of the file is too
+    small, the fit explains the missing force in contact by a bias, which readings of 0 at rest contradict.
+    """
+    sensor = mechanism.rig.force_sensor
+    if not sensor.dead_zone or sensor.dead_zone_kind == "cut" or sensor.bias_random_walk:
+        return []
+    readings = [np.zeros(0)]
+    for run in runs:
+        if run.force_measured is not None and run.kind == "contact":
+            readings.append(take_readings_before_contact(run))
+        elif run.force_measured is not None and run.kind in ("rest", "free"):
+            readings.append(run.valid_forces)
+    is_zero = np.concatenate(readings) == 0.0
+    if len(is_zero) < MIN_READINGS_AT_REST:
+        return []
+    found = float(np.mean(is_zero))
+    stated = [mechanism.uncertainty.get(f"rig.force_sensor.{key}") for key in ("bias", "dead_zone")]
+    stds = [(entry.std or 0.0) if entry else 0.0 for entry in stated]
+    error = BIAS_SIGMAS * float(np.linalg.norm(stds))
+    # Rounding has the effect of a larger zone.
+    zone, std = sensor.dead_zone + 0.5 * sensor.quantum, max(sensor.noise_std, 1e-12)
+    bias = np.abs(sensor.bias) + np.array([-error, 0.0, error])
+    expected = special.ndtr((zone - bias) / std) - special.ndtr((-zone - bias) / std)
+    if expected.min() - MAX_ZERO_SHARE_ERROR <= found <= expected.max() + MAX_ZERO_SHARE_ERROR:
+        return []
+    finding = f"{found:.0%} of the readings without contact are 0, expected {expected[1]:.0%} with a bias of "
+    finding += f"{sensor.bias:.2g} N"
+    peak = float(np.median(np.abs(contact.readings.force).max(axis=0)))
+    effect = max(zone, abs(sensor.bias)) / peak
+    return [CheckResult("dead zone of the force sensor", finding, True, effect)]
 
 
 def _check_stated_cut_zone(contact: ContactFit, touching: np.ndarray) -> list[CheckResult]:

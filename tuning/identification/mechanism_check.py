@@ -19,7 +19,11 @@ from tuning.identification.contact_problem import MAX_FORCE_DELAY, ContactProble
 from tuning.identification.contact_profile import Posterior
 from tuning.identification.contact_regression import CoefficientFit
 from tuning.identification.contact_runs import exclude_rows_after_gaps, split_long_run
-from tuning.identification.dead_zone_check import check_cut_dead_zone, check_zone_sampling
+from tuning.identification.dead_zone_check import (
+    check_cut_dead_zone,
+    check_zeros_at_rest,
+    check_zone_sampling,
+)
 from tuning.identification.drifting_noise import estimate_force_noise
 from tuning.identification.edge_check import check_contact_edges, check_force_smoothing
 from tuning.identification.force_readings import ForceReadings
@@ -92,7 +96,10 @@ def check_against_mechanism(
         flags = np.ones(len(touching), bool)
         lines += validation.check_contact_model(contact, touching, mass, frequency, lag, flags)
         lines += check_motion_in_contact(contact, touching, frequency)
-        lines += [*check_cut_dead_zone(contact, touching), *check_zone_sampling(mechanism)]
+        lines += check_cut_dead_zone(contact, touching) or check_zeros_at_rest(
+            contact, mechanism, campaign.runs
+        )
+        lines += check_zone_sampling(mechanism)
     effect = compute_uncertainty_effect(mechanism)
     if contact is not None and not _has_uncertain_dead_zone(mechanism):
         lines += check_contact_edges(contact, touching, effect)

@@ -105,31 +105,32 @@ def compute_uncertainty_effect(mechanism: Mechanism) -> UncertaintyEffect:
     return worst
 
 
-def compute_change_effect(
-    mechanism: Mechanism, changes: Mapping[int, np.ndarray], added_delay: float
-) -> tuple[float, float]:
-    """Compute how much a change of the contact law and of the force delay changes e and e - e*.
+def compute_change_effects(
+    mechanism: Mechanism, changes: Mapping[int, np.ndarray], added_delays: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Compute how much changes of the contact law and of the force delay change e and e - e*.
 
     Args:
         mechanism: Mechanism with the nominal parameters.
-        changes: Changes of the coefficients of `make_regression_law`; key i is the index of a contact in the
-            lists of `[contact]`.
-        added_delay: Change of the total force delay [s].
+        changes: Changes of the coefficients of `make_regression_law`, (cases, coefficients); key i is the
+            index of a contact in the lists of `[contact]`.
+        added_delays: Changes of the total force delay [s], (cases,).
 
     Returns:
-        The magnitudes of both effects, for the entry of the lists in `[contact]` with the largest effect.
+        The magnitudes of both effects for each case: the largest of all contacts in the lists.
     """
-    law, worst = mechanism_models.make_regression_law(mechanism.contact), (0.0, 0.0)
+    law = mechanism_models.make_regression_law(mechanism.contact)
+    on_restitution, on_error = np.zeros((2, len(added_delays)))
     for entry, change in changes.items():
         contact, frequency = _simulate_ideal_contact(mechanism, law, entry)
         if contact is None:
             continue
         ideal = change @ contact.coefficient_sensitivity
         gain = _compute_gain(mechanism, contact, frequency)
-        error = added_delay * contact.delay_sensitivity
-        restitution, differences = _combine_changes(ideal, error, gain)
-        worst = max(worst, (abs(float(restitution)), float(np.abs(differences).max())), key=max)
-    return worst
+        restitution, differences = _combine_changes(ideal, added_delays * contact.delay_sensitivity, gain)
+        on_restitution = np.maximum(on_restitution, np.abs(restitution))
+        on_error = np.maximum(on_error, np.max(np.abs(differences), axis=0))
+    return on_restitution, on_error
 
 
 def _compute_gain(mechanism: Mechanism, contact: _IdealContact, frequency: float) -> float:
