@@ -84,6 +84,9 @@ KINDS = {
     "late_position": Kind(late=20),
     "butterworth_2": Kind(_butterworth(2), defect=FILTER),
     "butterworth_4": Kind(_butterworth(4), defect=FILTER),
+    "butterworth_2_and_dead_zone": Kind(
+        lambda rng, rig: {**_butterworth(2)(rng, rig), **_dead_zone(rng, rig)}, defect=(*FILTER, "dead zone")
+    ),
     "butterworth_2_stated": Kind(_butterworth(2), states_filter=True),
     "butterworth_4_stated": Kind(_butterworth(4), states_filter=True),
     "cut_dead_zone": Kind(

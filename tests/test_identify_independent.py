@@ -108,6 +108,7 @@ def test_identify_verdict_is_good_for_campaign_of_independent_simulator(tmp_path
         ("butterworth_4", 8034, "with a filter of order"),
         ("butterworth_2", 8033, "with a filter of order"),
         ("butterworth_2", 9832, "with a filter of order"),
+        ("butterworth_2_and_dead_zone", 12000, "with a filter of order"),
         ("cut_dead_zone", 9845, "dead zone"),
     ],
 )

@@ -46,10 +46,9 @@ def check_hidden_filter(
         effect: Effect of the parameters' uncertainty on e and on e - e*.
 
     Returns:
-        A list with one check; empty if no parameter was identified, if the file states a filter, or if a dead
-        zone hides the onset of contact.
+        A list with one check; empty if no parameter was identified, or if the file states a filter.
     """
-    if not effect.parts or contact.readings.low_pass is not None or contact.dead_zone:
+    if not effect.parts or contact.readings.low_pass is not None:
         return []
     lag, *filters = (fit_filter(contact, mechanism, order) for order in (1, *HIDDEN_ORDERS))
     file = min(lag.misfit, _compute_misfit(contact))
