@@ -145,6 +145,8 @@ def check_intervals(rig, document):
         "rig.simulator.window": rig.window,
         "delay and lag of force" if lagging else "rig.force_sensor.delay": age,
     }
+    if not {"rig.simulator.natural_frequency", "rig.simulator.window"} & set(items):
+        del true["rig.simulator.delay"]  # a motion simulator of another structure has another delay
     return {
         key: bool(items[key]["low"] <= value <= items[key]["high"])
         for key, value in true.items()

@@ -31,7 +31,9 @@ TRIAL_RATIO, FIRST_TRIALS = 2.0, 4  # ratio and least number of successive time 
 AGE_STEP, MAX_AGE_SHIFT, MAX_PARABOLAS = 5e-5, 5e-4, 3  # steps of the search for the age of the force [s]
 # Steps of the grid: ages [s], and ratio of successive time constants; largest distance of an age [s]
 GRID_AGE_STEP, GRID_RATIO, MAX_AGE_REACH = 1e-4, 2.0**0.5, 4e-3
-MAX_GRID_DROP = 9.0  # largest increase of chi-squared on the grid, above the best fit
+# Largest increase of chi-squared on the grid, above the best fit. Unmodelled disturbances increase it in
+# proportion to chi-squared per degree of freedom, up to a limit: beyond it, other checks fail.
+MAX_GRID_DROP, MAX_REDUCED_CHI_SQUARE = 9.0, 2.0
 
 
 class GridFit(NamedTuple):
@@ -85,7 +87,7 @@ class _FilterFits:
         self.limits = MIN_TIME_CONSTANT_PERIODS * period, max(MAX_TIME_CONSTANT, self.start)
         if order == 1 and lag:  # the file has the best lag
             self.limits = self.start, self.start
-        self.near = delay + lag, plane
+        self.near, self.degrees_of_freedom = (delay + lag, plane), contact.degrees_of_freedom
         problem = ContactProblem(contact.problem.motion, readings, contact.law, surface, self.start)
         at_start = delay + lag - self.start * self.unit_delay, plane
         self.problem = summarise_deep_lanes(problem, at_start, has_known_delay=True)
@@ -129,7 +131,7 @@ class _FilterFits:
     def list_likely_time_constants(self, best: float) -> list[float]:
         """Return the likely time constants on a logarithmic grid around the best one."""
         values, (least, largest) = [best], self.limits
-        highest = self.at(best).misfit + MAX_GRID_DROP
+        highest = self._limit_misfit(best)
         for ratio in (1.0 / GRID_RATIO, GRID_RATIO):
             value = best * ratio
             while least <= value <= largest and self.at(value).misfit < highest:
@@ -146,10 +148,17 @@ class _FilterFits:
                 age = fits[-1].age + side * GRID_AGE_STEP
                 fits.append(_fit_contact(self.problems[time_constant], age, fits[-1].plane, lag))
                 is_at_limit = fits[-1].age == fits[-2].age
-                if is_at_limit or fits[-1].misfit > best.misfit + MAX_GRID_DROP:
+                if is_at_limit or fits[-1].misfit > self._limit_misfit(time_constant):
                     break
             sides.append(fits[1:])
         return [*reversed(sides[0]), best, *sides[1]]
+
+    def _limit_misfit(self, time_constant: float) -> float:
+        """Return the largest misfit of a likely fit, from the best fit at a time constant."""
+        least = self.at(time_constant).misfit
+        return least + MAX_GRID_DROP * float(
+            np.clip(least / self.degrees_of_freedom, 1.0, MAX_REDUCED_CHI_SQUARE)
+        )
 
 
 def _list_hypotheses(profile: list[GridFit], damping_indices: list[int]) -> list[GridFit]:
