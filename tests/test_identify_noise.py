@@ -64,11 +64,13 @@ def test_noise_at_rest_is_unknown_for_mostly_zero_readings():
     assert not estimate_noise(signal).silent
 
 
-def test_single_reading_beyond_dead_zone_shows_no_rounding():
+def test_single_reading_beyond_dead_zone_shows_no_rounding_but_many_equal_ones_do():
     readings = np.zeros(2500)
     readings[1000] = -2.0
     result = estimate_noise(readings)
     assert result.silent and result.quantum == 0.0
+    readings[::20] = -2.0
+    assert estimate_noise(readings).quantum == 2.0
 
 
 @pytest.mark.parametrize(("quantum", "noise"), [(0.0, 0.0), (0.1, 0.0), (0.0, 0.3), (0.1, 0.3)])

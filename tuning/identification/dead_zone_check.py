@@ -24,9 +24,10 @@ SHIFTED_TICKS = 3.0
 MIN_READINGS_OUTSIDE_ZONE = 20  # minimum expected number of readings that exceed a stated zone
 ZONE_TOLERANCE = 0.1  # maximum error of a stated size, divided by the size
 MIN_OUTSIDE_SHARE = 0.2  # minimum ratio of readings that exceed a stated zone to their expected number
-BIAS_SIGMAS = 3.0  # largest error of the bias in the check of zeros, in standard deviations
-MIN_READINGS_AT_REST = 100  # least number of readings without contact for the check of zeros
-MAX_ZERO_SHARE_ERROR = 0.2  # largest error of the expected share of zeros
+BIAS_SIGMAS = 3.0  # maximum error of the bias in the check of zeros, in standard deviations
+MIN_READINGS_AT_REST = 100  # minimum number of readings without contact for the check of zeros
+# Maximum error of the expected share of zeros: the noise may be correlated, and the bias may drift.
+MAX_ZERO_SHARE_ERROR = 0.2
 
 
 def check_cut_dead_zone(contact: ContactFit, runs: list[LoggedRun]) -> list[CheckResult]:
@@ -100,20 +101,23 @@ def check_zeros_at_rest(
     is_zero = np.concatenate(readings) == 0.0
     if len(is_zero) < MIN_READINGS_AT_REST:
         return []
-    found = float(np.mean(is_zero))
-    stated = [mechanism.uncertainty.get(f"rig.force_sensor.{key}") for key in ("bias", "dead_zone")]
-    stds = [(entry.std or 0.0) if entry else 0.0 for entry in stated]
-    error = BIAS_SIGMAS * float(np.linalg.norm(stds))
+    share = float(np.mean(is_zero))
+    entries = [mechanism.uncertainty.get(f"rig.force_sensor.{key}") for key in ("bias", "dead_zone")]
+    stds = [entry.std for entry in entries if entry is not None]
+    if None in stds:
+        return []
+    error = BIAS_SIGMAS * float(np.linalg.norm(np.array(stds, float)))
     # Rounding has the effect of a larger zone.
     zone, std = sensor.dead_zone + 0.5 * sensor.quantum, max(sensor.noise_std, 1e-12)
-    bias = np.abs(sensor.bias) + np.array([-error, 0.0, error])
+    size = abs(sensor.bias)
+    bias = np.array([max(size - error, 0.0), size, size + error])
     expected = special.ndtr((zone - bias) / std) - special.ndtr((-zone - bias) / std)
-    if expected.min() - MAX_ZERO_SHARE_ERROR <= found <= expected.max() + MAX_ZERO_SHARE_ERROR:
+    if expected.min() - MAX_ZERO_SHARE_ERROR <= share <= expected.max() + MAX_ZERO_SHARE_ERROR:
         return []
-    finding = f"{found:.0%} of the readings without contact are 0, expected {expected[1]:.0%} with a bias of "
+    finding = f"{share:.0%} of the readings without contact are 0, expected {expected[1]:.0%} with a bias of "
     finding += f"{sensor.bias:.2g} N"
-    peak = float(np.median(np.abs(contact.readings.force).max(axis=0)))
-    effect = max(zone, abs(sensor.bias)) / peak
+    peaks = np.abs(contact.readings.force).max(axis=0)
+    effect = max(zone, size) / float(np.median(peaks[peaks > 0.0])) if peaks.any() else 1.0
     return [CheckResult("dead zone of the force sensor", finding, True, effect)]
 
 

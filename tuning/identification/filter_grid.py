@@ -27,13 +27,17 @@ from tuning.identification.uncertainty_effect import FORCE_DELAY_KEY
 
 ASSUMED_CUTOFF = 100.0  # Hz; only kind and order matter until the cutoff is fitted
 START_TIME_CONSTANT_PERIODS = 0.25  # first time constant without a lag in the file, in control periods
-TRIAL_RATIO, FIRST_TRIALS = 2.0, 4  # ratio and least number of successive time constants in the search
-AGE_STEP, MAX_AGE_SHIFT, MAX_PARABOLAS = 5e-5, 5e-4, 3  # steps of the search for the age of the force [s]
-# Steps of the grid: ages [s], and ratio of successive time constants; largest distance of an age [s]
-GRID_AGE_STEP, GRID_RATIO, MAX_AGE_REACH = 1e-4, 2.0**0.5, 4e-3
-# Largest increase of chi-squared on the grid, above the best fit. Unmodelled disturbances increase it in
-# proportion to chi-squared per degree of freedom, up to a limit: beyond it, other checks fail.
-MAX_GRID_DROP, MAX_REDUCED_CHI_SQUARE = 9.0, 2.0
+TRIAL_RATIO = 2.0  # ratio of successive time constants in the search
+FIRST_TRIALS = 4  # number of time constants that begin the search
+AGE_STEP = 5e-5  # step of the search for the age of the force [s]
+MAX_AGE_SHIFT = 5e-4  # maximum shift of the age by a parabola [s]
+MAX_PARABOLAS = 3  # maximum number of parabolas
+GRID_AGE_STEP = 1e-4  # step of the ages on the grid [s]
+GRID_RATIO = 2.0**0.5  # ratio of successive time constants on the grid
+MAX_AGE_REACH = 4e-3  # maximum distance between an age on the grid and the best one [s]
+MAX_GRID_INCREASE = 9.0  # maximum increase of chi-squared on the grid, above the best fit
+# Unmodelled disturbances multiply chi-squared, at most by this factor: beyond it, other checks fail.
+MAX_REDUCED_CHI_SQUARE = 2.0
 
 
 class GridFit(NamedTuple):
@@ -52,8 +56,13 @@ class FilterFit(NamedTuple):
 
     order: int
     cutoff: float  # Hz
-    misfit: float  # chi-squared
+    best: GridFit
     grid: list[GridFit]  # empty for order 1
+
+    @property
+    def misfit(self) -> float:
+        """Return chi-squared of the best fit, without the penalty of negative damping."""
+        return self.best.misfit - self.best.penalty
 
 
 def fit_filter(contact: ContactFit, mechanism: Mechanism, order: int) -> FilterFit:
@@ -66,12 +75,18 @@ def fit_filter(contact: ContactFit, mechanism: Mechanism, order: int) -> FilterF
     """
     fits = _FilterFits(contact, mechanism, order)
     best = fits.find_best_time_constant()
-    has_free_delay, grid = FORCE_DELAY_KEY in mechanism.uncertainty, []
-    for time_constant in fits.list_likely_time_constants(best) if order > 1 else []:
-        profile = fits.profile_age(time_constant) if has_free_delay else [fits.at(time_constant)]
-        grid += _list_hypotheses(profile, fits.problem.damping_indices)
-    best = min([best, *fits.found], key=lambda time_constant: fits.at(time_constant).misfit)
-    return FilterFit(order, 0.5 / (np.pi * best), fits.at(best).misfit, grid)
+    grid = [
+        point
+        for time_constant in (fits.list_likely_time_constants(best) if order > 1 else [])
+        for point in fits.list_hypotheses(time_constant)
+    ]
+    best = min(fits.best_fits, key=lambda time_constant: fits.at(time_constant).misfit)
+    return FilterFit(order, 0.5 / (np.pi * best), fits.at(best), grid)
+
+
+def has_free_delay(mechanism: Mechanism) -> bool:
+    """Return whether the file's force delay is uncertain, so that the grid covers all likely ages."""
+    return FORCE_DELAY_KEY in mechanism.uncertainty
 
 
 class _FilterFits:
@@ -84,26 +99,28 @@ class _FilterFits:
         surface = None if "rig.contact_plane" in mechanism.uncertainty else plane
         self.unit_delay = readings.modes.delay  # delay of the filter, divided by the time constant
         self.start = max(lag, START_TIME_CONSTANT_PERIODS * period) / self.unit_delay
-        self.limits = MIN_TIME_CONSTANT_PERIODS * period, max(MAX_TIME_CONSTANT, self.start)
+        least = MIN_TIME_CONSTANT_PERIODS * period
+        self.limits = least, max(MAX_TIME_CONSTANT, self.start, TRIAL_RATIO * least)
         if order == 1 and lag:  # the file has the best lag
             self.limits = self.start, self.start
-        self.near, self.degrees_of_freedom = (delay + lag, plane), contact.degrees_of_freedom
+        self.near, self.has_free_delay = (delay + lag, plane), has_free_delay(mechanism)
+        self.degrees_of_freedom = contact.degrees_of_freedom
         problem = ContactProblem(contact.problem.motion, readings, contact.law, surface, self.start)
         at_start = delay + lag - self.start * self.unit_delay, plane
         self.problem = summarise_deep_lanes(problem, at_start, has_known_delay=True)
         self.problems: dict[float, ContactProblem] = {}
-        self.found: dict[float, GridFit] = {}
+        self.best_fits: dict[float, GridFit] = {}
 
     def at(self, time_constant: float) -> GridFit:
         """Return the fit with the best age of the force."""
-        if time_constant not in self.found:
-            nearest = min(self.found, key=lambda other: abs(np.log(other / time_constant)), default=None)
-            age, plane = self.near if nearest is None else self.found[nearest][:2]
+        if time_constant not in self.best_fits:
+            nearest = min(self.best_fits, key=lambda other: abs(np.log(other / time_constant)), default=None)
+            age, plane = self.near if nearest is None else self.best_fits[nearest][:2]
             lag = time_constant * self.unit_delay
             problem = self.problem.changed(self.problem.law, time_constant, self.near[0] - lag)
             self.problems[time_constant] = problem
-            self.found[time_constant] = _fit_age(problem, age, plane, lag)
-        return self.found[time_constant]
+            self.best_fits[time_constant] = _fit_age(problem, age, plane, lag)
+        return self.best_fits[time_constant]
 
     def find_best_time_constant(self) -> float:
         """Find the time constant with the smallest misfit."""
@@ -112,8 +129,8 @@ class _FilterFits:
             return self.at(time_constant).misfit
 
         least, largest = self.limits
-        trials = self.start * TRIAL_RATIO ** np.arange(FIRST_TRIALS)
-        best = min((trials[(trials >= least) & (trials <= largest)]).tolist(), key=misfit)
+        trials = np.clip(self.start * TRIAL_RATIO ** np.arange(FIRST_TRIALS), least, largest)
+        best = min(trials.tolist(), key=misfit)
         while True:
             low, high = max(best / TRIAL_RATIO, least), min(best * TRIAL_RATIO, largest)
             better = min(low, high, key=misfit)
@@ -139,44 +156,50 @@ class _FilterFits:
                 value *= ratio
         return values
 
-    def profile_age(self, time_constant: float) -> list[GridFit]:
+    def list_hypotheses(self, time_constant: float) -> list[GridFit]:
+        """Return all likely fits at a time constant, with prior probabilities."""
+        if not self.has_free_delay:
+            return [self.at(time_constant)]
+        profile, dampings = self._profile_age(time_constant), self.problem.damping_indices
+        if len(profile) == 1 or not dampings:
+            return profile
+        spacing = float(np.log(GRID_AGE_STEP / MAX_DAMPING_OVER_STIFFNESS))
+        hypotheses = [fit._replace(log_prior=spacing) for fit in profile]
+        for below, above in pairwise(profile):
+            low, high = (float(fit.coefficients[dampings].mean()) for fit in (below, above))
+            if low < 0.0 <= high:
+                age = below.age - low / (high - low) * (above.age - below.age)
+                undamped = self._fit_contact(time_constant, age, below.plane)
+                hypotheses.append(undamped._replace(misfit=undamped.misfit - undamped.penalty))
+        return hypotheses
+
+    def _profile_age(self, time_constant: float) -> list[GridFit]:
         """Fit the contact at ages around the best one; return the likely fits, sorted by age."""
-        best, lag, sides = self.at(time_constant), time_constant * self.unit_delay, []
+        best, sides = self.at(time_constant), []
         for side in (-1.0, 1.0):
             fits = [best]
             while abs(fits[-1].age - best.age) < MAX_AGE_REACH:
-                age = fits[-1].age + side * GRID_AGE_STEP
-                fits.append(_fit_contact(self.problems[time_constant], age, fits[-1].plane, lag))
-                is_at_limit = fits[-1].age == fits[-2].age
-                if is_at_limit or fits[-1].misfit > self._limit_misfit(time_constant):
+                fit = self._fit_contact(time_constant, fits[-1].age + side * GRID_AGE_STEP, fits[-1].plane)
+                if fit.age == fits[-1].age:  # at a limit of the delay
+                    break
+                fits.append(fit)
+                if fit.misfit > self._limit_misfit(time_constant):
                     break
             sides.append(fits[1:])
         return [*reversed(sides[0]), best, *sides[1]]
 
+    def _fit_contact(self, time_constant: float, age: float, plane: float) -> GridFit:
+        return _fit_contact(self.problems[time_constant], age, plane, time_constant * self.unit_delay)
+
     def _limit_misfit(self, time_constant: float) -> float:
         """Return the largest misfit of a likely fit, from the best fit at a time constant."""
         least = self.at(time_constant).misfit
-        return least + MAX_GRID_DROP * float(
-            np.clip(least / self.degrees_of_freedom, 1.0, MAX_REDUCED_CHI_SQUARE)
-        )
+        return least + MAX_GRID_INCREASE * find_scale(least, self.degrees_of_freedom)
 
 
-def _list_hypotheses(profile: list[GridFit], damping_indices: list[int]) -> list[GridFit]:
-    """Return a profile of the age with prior probabilities, and the fit without damping if it is on it."""
-    if len(profile) == 1 or not damping_indices:
-        return profile
-    spacing = float(np.log(GRID_AGE_STEP / MAX_DAMPING_OVER_STIFFNESS))
-    hypotheses = [fit._replace(log_prior=spacing) for fit in profile]
-    for below, above in pairwise(profile):
-        low, high = (float(fit.coefficients[damping_indices].mean()) for fit in (below, above))
-        if low < 0.0 <= high:
-            share = -low / (high - low)
-            pairs = [(below.age, above.age), (below.plane, above.plane)]
-            pairs.append((below.misfit - below.penalty, above.misfit - above.penalty))
-            age, plane, misfit = (start + share * (end - start) for start, end in pairs)
-            coefficients = below.coefficients + share * (above.coefficients - below.coefficients)
-            hypotheses.append(GridFit(age, plane, coefficients, misfit, 0.0))
-    return hypotheses
+def find_scale(misfit: float, degrees_of_freedom: int) -> float:
+    """Return the factor by which unmodelled disturbances multiply chi-squared."""
+    return float(np.clip(misfit / degrees_of_freedom, 1.0, MAX_REDUCED_CHI_SQUARE))
 
 
 def _fit_age(problem: ContactProblem, age: float, plane: float, lag: float) -> GridFit:

@@ -3,10 +3,10 @@
 A filter of order 2 or 4 resembles a lag with a longer delay. The fit of a lag can therefore absorb it. The
 damping is then wrong, because only the onset of contact distinguishes damping from delay.
 
-The check fits Butterworth filters of both orders in place of the lag (see `filter_grid`). The error of e - e*
-then has a mixture of normal distributions: around 0 if the file is right, or around the difference between a
-filter on the grid and the file. The weights are the likelihoods of the fits, times the prior probabilities of
-the filters. The effect of the check is the increase of the error's bound by the mixture.
+The check fits Butterworth filters of both orders in place of the lag (see `filter_grid`). The errors of e and
+e - e* then have mixtures of normal distributions: around 0 if the file is right, or around the change from
+the file to a filter on the grid. The weights are the likelihoods of the fits, times the prior probabilities
+of the filters. The effect of the check is the increase of the errors' bounds by the mixtures.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from scipy import optimize, special
 
 from jaxhil.mechanism.structs import Mechanism
 from tuning.identification.contact_fit import ContactFit
-from tuning.identification.filter_grid import FilterFit, fit_filter
+from tuning.identification.filter_grid import FilterFit, find_scale, fit_filter, has_free_delay
 from tuning.identification.uncertainty_effect import (
     EFFECT_PROBABILITY,
     SIMULATOR_PREFIX,
@@ -32,6 +32,7 @@ MAX_LIKELIHOOD_DROP = 6.0  # largest increase of chi-squared with a filter that 
 PRIOR_FILTER_PROBABILITY = 0.1  # prior probability of each order; data sheets usually state such a filter
 # bound of an effect, in standard deviations
 BOUND_SIGMAS = float(special.ndtri(0.5 + 0.5 * EFFECT_PROBABILITY))
+MAX_STIFFNESS_CHANGE = 0.3  # maximum relative change of the stiffness of an entry that the logs determine
 MIN_EFFECT = 1e-3  # smallest effect on e or e - e* that the check reports
 
 
@@ -48,23 +49,24 @@ def check_hidden_filter(
     Returns:
         A list with one check; empty if no parameter was identified, or if the file states a filter.
     """
-    if not effect.parts or contact.readings.low_pass is not None:
+    if not effect.parts or contact.readings.low_pass is not None or contact.degrees_of_freedom <= 0:
         return []
     lag, *filters = (fit_filter(contact, mechanism, order) for order in (1, *HIDDEN_ORDERS))
     file = min(lag.misfit, _compute_misfit(contact))
-    # Unmodelled disturbances enlarge all misfits.
-    scale = max(1.0, min(file, *(fit.misfit for fit in filters)) / contact.degrees_of_freedom)
+    scale = find_scale(min(file, *(fit.misfit for fit in filters)), contact.degrees_of_freedom)
     gains = [(file - fit.misfit) / scale for fit in filters]
     weights, changes = [np.log([1.0 - PRIOR_FILTER_PROBABILITY * len(filters)])], [np.zeros((2, 1))]
-    stds = [np.array(effect[:2])[:, None] / BOUND_SIGMAS]
-    # On the grid, only the motion simulator is uncertain.
+    file_std = np.array(effect[:2])[:, None] / BOUND_SIGMAS
+    stds = [file_std]
+    # The grid covers the errors of delay and damping if the delay is uncertain.
     motion = float(np.linalg.norm([p for key, p in effect.parts.items() if key.startswith(SIMULATOR_PREFIX)]))
+    grid_std = np.minimum(motion / BOUND_SIGMAS, file_std) if has_free_delay(mechanism) else file_std
     for fit, gain in zip(filters, gains, strict=True):
         if gain > -MAX_LIKELIHOOD_DROP:
             log_weights = [point.log_prior - 0.5 * point.misfit / scale for point in fit.grid]
             weights.append(np.log(PRIOR_FILTER_PROBABILITY) + 0.5 * gain + special.log_softmax(log_weights))
-            changes.append(_compute_changes(contact, mechanism, fit))
-            stds.append(np.full((2, len(fit.grid)), motion / BOUND_SIGMAS))
+            changes.append(_compute_changes(contact, mechanism, fit, lag))
+            stds.append(np.repeat(grid_std, len(fit.grid), axis=1))
     probabilities = special.softmax(np.concatenate(weights))
     increases = [
         max(_find_bound(probabilities, change, std) - bound, 0.0)
@@ -98,22 +100,35 @@ def _describe(
     )
 
 
-def _compute_changes(contact: ContactFit, mechanism: Mechanism, fit: FilterFit) -> np.ndarray:
-    """Return the changes of e and of e - e* from the file to each fit on the grid, shape (2, fits)."""
+def _compute_changes(contact: ContactFit, mechanism: Mechanism, fit: FilterFit, lag: FilterFit) -> np.ndarray:
+    """Return the changes of e and of e - e* from the file to each fit on the grid, shape (2, fits).
+
+    Entries of the contact lists that the logs hardly determine are ignored: those whose stiffness in the fit
+    of a lag differs from the file.
+    """
     delay, _, file = contact.posterior.best
-    entries = contact.readings.entries
-    coefficients = np.array([point.coefficients for point in fit.grid]) - file.coefficients[:-1]
-    by_entry = coefficients.reshape(len(fit.grid), len(entries), -1).swapaxes(0, 1)
+    entries, stated = contact.readings.entries, file.coefficients[:-1]
+
+    def split(coefficients: np.ndarray) -> np.ndarray:
+        return coefficients.reshape(*coefficients.shape[:-1], len(entries), -1)
+
+    stiffness, refitted = split(stated)[:, 0], split(lag.best.coefficients)[:, 0]
+    is_determined = np.abs(refitted - stiffness) <= MAX_STIFFNESS_CHANGE * np.abs(stiffness)
+    differences = split(np.array([point.coefficients for point in fit.grid]) - stated)
+    table = {
+        entry: differences[:, i] for i, entry in enumerate(entries) if is_determined[i] or len(entries) == 1
+    }
     added = np.array([point.age for point in fit.grid]) - delay - mechanism.rig.force_sensor.time_constant
-    return np.array(compute_change_effects(mechanism, dict(zip(entries, by_entry, strict=True)), added))
+    return np.array(compute_change_effects(mechanism, table, added))
 
 
 def _compute_misfit(contact: ContactFit) -> float:
-    """Return chi-squared of the file."""
-    delay, plane, fit = contact.posterior.best
+    """Return chi-squared of the file, as that of the fits: with the deviation of the bias from its prior."""
+    (delay, plane, fit), prior = contact.posterior.best, contact.readings.bias
+    deviation = 0.0 if prior is None else (fit.coefficients[-1] - prior[0]) / prior[1]
     residual = contact.readings.force - contact.problem.force(delay, plane, fit.coefficients)
     whitened = contact.problem.whiten(residual) / contact.readings.std
-    return float(np.sum(whitened[contact.readings.counts] ** 2))
+    return float(np.sum(whitened[contact.readings.counts] ** 2) + deviation**2)
 
 
 def _find_bound(probabilities: np.ndarray, changes: np.ndarray, stds: np.ndarray) -> float:
@@ -121,7 +136,7 @@ def _find_bound(probabilities: np.ndarray, changes: np.ndarray, stds: np.ndarray
 
     Args:
         probabilities: Probability of each model.
-        changes: Mean error of the file if this model is true.
+        changes: Magnitude of the file's mean error if this model is true.
         stds: Standard deviation of the error if this model is true.
     """
     stds = np.maximum(stds, 1e-12)

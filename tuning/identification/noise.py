@@ -16,7 +16,11 @@ import numpy as np
 from scipy import linalg, optimize, special
 from scipy.signal import lfilter
 
-from tuning.identification.hidden_noise import HiddenNoise, estimate_hidden_noise
+from tuning.identification.hidden_noise import (
+    MIN_READINGS_BEYOND_DEAD_ZONE,
+    HiddenNoise,
+    estimate_hidden_noise,
+)
 
 MAX_AUTOREGRESSION_ORDER = 8  # maximum order of the autoregression
 MAX_DISTINCT_SHARE = 0.2  # maximum number of distinct values per reading in rounded readings
@@ -66,8 +70,9 @@ def estimate_noise(readings: np.ndarray) -> NoiseEstimate:
     number = len(readings)
     if _has_excess_zeros(readings, quantum):
         hidden = estimate_hidden_noise(readings, quantum)
+        std = 0.0 if hidden is None else hidden.std
         # A few readings beyond a dead zone may be equal by chance.
-        std, quantum = (0.0, 0.0) if hidden is None else (hidden.std, quantum)
+        quantum = quantum if np.count_nonzero(readings) >= MIN_READINGS_BEYOND_DEAD_ZONE else 0.0
         return NoiseEstimate(0.0, std, np.inf, np.inf, quantum, True, (1.0,), number, 0.0, hidden)
     if np.ptp(readings) == 0.0:
         return NoiseEstimate(float(readings[0]), 0.0, 0.0, 0.0, quantum, False, (1.0,), number)
