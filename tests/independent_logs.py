@@ -87,6 +87,9 @@ KINDS = {
     "butterworth_2_and_dead_zone": Kind(
         lambda rng, rig: {**_butterworth(2)(rng, rig), **_dead_zone(rng, rig)}, defect=(*FILTER, "dead zone")
     ),
+    "butterworth_2_and_low_damping": Kind(
+        lambda rng, rig: {**_butterworth(2)(rng, rig), "damping": 0.15 * rig.damping}, defect=FILTER
+    ),
     "butterworth_2_stated": Kind(_butterworth(2), states_filter=True),
     "butterworth_4_stated": Kind(_butterworth(4), states_filter=True),
     "cut_dead_zone": Kind(

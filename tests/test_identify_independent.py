@@ -109,6 +109,7 @@ def test_identify_verdict_is_good_for_campaign_of_independent_simulator(tmp_path
         ("butterworth_2", 8033, "with a filter of order"),
         ("butterworth_2", 9832, "with a filter of order"),
         ("butterworth_2_and_dead_zone", 12000, "with a filter of order"),
+        ("butterworth_2_and_low_damping", 15000, "uncertain"),
         ("cut_dead_zone", 9845, "dead zone"),
     ],
 )

@@ -2,8 +2,8 @@
 
 A filter smooths the onset of contact, so that many pairs of damping and delay can explain the logs. The grid
 therefore contains all likely cutoffs and, at each cutoff, all likely ages of the force (sum of the force
-delay and the filter's delay at low frequencies). As in `damping_average`, zero damping has a prior
-probability of one half; otherwise, the ratio of damping to stiffness is uniform.
+delay and the filter's delay at low frequencies). As in `damping_average`, the damping may be zero; otherwise,
+the ratio of damping to stiffness has a uniform prior.
 """
 
 from __future__ import annotations
@@ -35,6 +35,9 @@ MAX_PARABOLAS = 3  # maximum number of parabolas
 GRID_AGE_STEP = 1e-4  # step of the ages on the grid [s]
 GRID_RATIO = 2.0**0.5  # ratio of successive time constants on the grid
 MAX_AGE_REACH = 4e-3  # maximum distance between an age on the grid and the best one [s]
+# Prior probability of zero damping. It is smaller than in `damping_average`, because every mechanism has some
+# damping, and a filter hides a small one.
+UNDAMPED_PROBABILITY = 0.1
 MAX_GRID_INCREASE = 9.0  # maximum increase of chi-squared on the grid, above the best fit
 # Unmodelled disturbances multiply chi-squared, at most by this factor: beyond it, other checks fail.
 MAX_REDUCED_CHI_SQUARE = 2.0
@@ -163,14 +166,19 @@ class _FilterFits:
         profile, dampings = self._profile_age(time_constant), self.problem.damping_indices
         if len(profile) == 1 or not dampings:
             return profile
-        spacing = float(np.log(GRID_AGE_STEP / MAX_DAMPING_OVER_STIFFNESS))
-        hypotheses = [fit._replace(log_prior=spacing) for fit in profile]
+        share = (1.0 - UNDAMPED_PROBABILITY) * GRID_AGE_STEP / MAX_DAMPING_OVER_STIFFNESS
+        hypotheses = [fit._replace(log_prior=float(np.log(share))) for fit in profile]
         for below, above in pairwise(profile):
             low, high = (float(fit.coefficients[dampings].mean()) for fit in (below, above))
             if low < 0.0 <= high:
                 age = below.age - low / (high - low) * (above.age - below.age)
                 undamped = self._fit_contact(time_constant, age, below.plane)
-                hypotheses.append(undamped._replace(misfit=undamped.misfit - undamped.penalty))
+                hypotheses.append(
+                    undamped._replace(
+                        misfit=undamped.misfit - undamped.penalty,
+                        log_prior=float(np.log(UNDAMPED_PROBABILITY)),
+                    )
+                )
         return hypotheses
 
     def _profile_age(self, time_constant: float) -> list[GridFit]:
