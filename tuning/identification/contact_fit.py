@@ -20,7 +20,11 @@ from tuning.identification.clock_drift import ClockDrift
 from tuning.identification.contact_laws import Law, kelvin_voigt
 from tuning.identification.contact_problem import MAX_FORCE_DELAY, ContactProblem
 from tuning.identification.contact_profile import Posterior, compute_posterior
-from tuning.identification.cut_zone import estimate_bias_before_contact, find_largest_size
+from tuning.identification.cut_zone import (
+    estimate_bias_before_contact,
+    estimate_subtracted_bias,
+    find_largest_size,
+)
 from tuning.identification.deep_contact import summarise_deep_lanes
 from tuning.identification.force_readings import ForceReadings
 from tuning.identification.hidden_noise import HiddenNoise
@@ -174,10 +178,10 @@ def _prepare_readings(
     zone = sensor.dead_zone
     cut = find_largest_size(runs) if noise_is_hidden and zone and sensor.dead_zone_kind == "cut" else 0.0
     if noise is not None and noise_is_hidden and noise.hidden is not None:
-        prior = noise.hidden.missing_force
+        missing_force, std = noise.hidden.missing_force
+        prior = -missing_force, std
     if noise_is_hidden and zone and not cut:
-        hidden, std = estimate_bias_before_contact(runs, zone, True)
-        prior = zone - hidden, float(np.hypot(std, SPECIFIED_DEAD_ZONE_STD * zone))
+        prior = estimate_subtracted_bias(runs, zone, SPECIFIED_DEAD_ZONE_STD * zone)
     low_pass = None if noise_is_hidden else sensor.filter
     if noise is None or noise_is_hidden or noise.std == 0.0:
         readings = ForceReadings.of(runs, 1.0, threshold=1.0 if noise_is_hidden else 0.0)
@@ -191,12 +195,8 @@ def _prepare_readings(
         plane = plane if prior else usual
     else:
         readings = replace(_make_readings(runs, noise), low_pass=low_pass)
-    # If there is a dead zone, the parameter "bias" represents the force that the dead zone removes.
-    bias = (
-        find_bias_prior(runs, motion, noise, plane)
-        if not noise_is_hidden
-        else prior and (-prior[0], prior[1])
-    )
+    # If there is a dead zone, the parameter "bias" is the bias minus the dead zone.
+    bias = prior if noise_is_hidden else find_bias_prior(runs, motion, noise, plane)
     return replace(readings, bias=bias), plane
 
 

@@ -53,6 +53,21 @@ def estimate_bias_before_contact(
     return (0.0, ASSUMED_BIAS_SHARE * zone) if estimate is None else estimate
 
 
+def estimate_subtracted_bias(runs: Sequence[LoggedRun], zone: float, zone_std: float) -> tuple[float, float]:
+    """Estimate the bias that a continuous dead zone hides, minus the zone: the readings in contact show it.
+
+    Args:
+        runs: Runs that begin before contact.
+        zone: Size of the zone [N].
+        zone_std: Standard deviation of the size [N].
+
+    Returns:
+        Mean and standard deviation [N].
+    """
+    bias, std = estimate_bias_before_contact(runs, zone, True)
+    return bias - zone, float(np.hypot(std, zone_std))
+
+
 def take_readings_before_contact(run: LoggedRun) -> np.ndarray:
     """Return the first half of the readings that precede the first large force."""
     force = run.valid_forces

@@ -19,7 +19,7 @@ from tuning.identification.contact_problem import MAX_FORCE_DELAY, ContactProble
 from tuning.identification.contact_profile import Posterior
 from tuning.identification.contact_regression import CoefficientFit
 from tuning.identification.contact_runs import exclude_rows_after_gaps, split_long_run
-from tuning.identification.cut_zone import estimate_bias_before_contact
+from tuning.identification.cut_zone import estimate_bias_before_contact, estimate_subtracted_bias
 from tuning.identification.dead_zone_check import (
     check_cut_dead_zone,
     check_zeros_at_rest,
@@ -186,8 +186,13 @@ def _make_contact_fit(
     is_cut = rig.force_sensor.dead_zone_kind == "cut"
     readings = replace(readings, zone=rig.force_sensor.dead_zone if is_cut else 0.0)
     subtracts = has_dead_zone and not is_cut
-    if has_dead_zone:
-        readings = replace(readings, bias=_estimate_hidden_bias(runs, mechanism))
+    if is_cut and has_dead_zone:
+        readings = replace(readings, bias=estimate_bias_before_contact(runs, rig.force_sensor.dead_zone))
+    if subtracts:
+        entry = mechanism.uncertainty.get("rig.force_sensor.dead_zone")
+        zone_std = (entry.std or 0.0) if entry else 0.0
+        bias = estimate_subtracted_bias(runs, rig.force_sensor.dead_zone, zone_std)
+        readings = replace(readings, bias=bias)
     coefficients.append(rig.force_sensor.bias - (rig.force_sensor.dead_zone if subtracts else 0.0))
     values = np.array(coefficients)
     if not std:
@@ -225,15 +230,6 @@ def _estimate_force_noise(runs: Sequence[LoggedRun], mechanism: Mechanism) -> No
                 if len(run.valid_forces) >= 200:
                     return estimate_force_noise(run.valid_forces, mechanism.rig.control_period, walk)
     return None
-
-
-def _estimate_hidden_bias(runs: Sequence[LoggedRun], mechanism: Mechanism) -> tuple[float, float]:
-    """Return mean and standard deviation [N] of the hidden bias, minus the zone if it is continuous."""
-    sensor, entry = mechanism.rig.force_sensor, mechanism.uncertainty.get("rig.force_sensor.dead_zone")
-    subtracted = 0.0 if sensor.dead_zone_kind == "cut" else sensor.dead_zone
-    bias, std = estimate_bias_before_contact(runs, sensor.dead_zone, subtracted > 0.0)
-    zone_std = (entry.std or 0.0) if entry and subtracted else 0.0
-    return bias - subtracted, max(float(np.hypot(std, zone_std)), 1e-9)
 
 
 def _estimate_row_noise(problem: ContactProblem, delay: float, plane: float, values: np.ndarray) -> float:

@@ -72,7 +72,8 @@ def estimate_noise(readings: np.ndarray) -> NoiseEstimate:
         hidden = estimate_hidden_noise(readings, quantum)
         std = 0.0 if hidden is None else hidden.std
         # A few readings beyond a dead zone may be equal by chance.
-        quantum = quantum if np.count_nonzero(readings) >= MIN_READINGS_BEYOND_DEAD_ZONE else 0.0
+        if np.count_nonzero(readings) < MIN_READINGS_BEYOND_DEAD_ZONE:
+            quantum = 0.0
         return NoiseEstimate(0.0, std, np.inf, np.inf, quantum, True, (1.0,), number, 0.0, hidden)
     if np.ptp(readings) == 0.0:
         return NoiseEstimate(float(readings[0]), 0.0, 0.0, 0.0, quantum, False, (1.0,), number)
